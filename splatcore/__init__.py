@@ -1,0 +1,32 @@
+"""SplatCT's engine: joint Gaussian-splat reconstruction and pose calibration of X-ray CT.
+
+A library first: `splatcore` needs no server. Importing it loads neither torch nor numpy;
+each name loads its module on first use (PEP 562).
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Options": "options",
+    "Progress": "progress",
+    "Scan": "scan",
+    "check_scan": "scan",
+    "evaluate": "evaluate",
+    "read_scan": "scan",
+    "reconstruct": "reconstruct",
+    "simulate": "simulate",
+    "write_results": "results",
+}
+
+__all__ = [*_HOME, "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'splatcore' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"splatcore.{_HOME[name]}"), name)

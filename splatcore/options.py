@@ -1,0 +1,71 @@
+"""Every knob of the engine: its name, unit, range and default. The one truth for the
+command line, the HTTP API and the worker. Standard library only: the server imports it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from splatcore.errors import OptionsError
+
+Calibrate = Literal["full", "static", "none"]
+Quality = Literal["preview", "normal", "fine"]
+
+
+def _knob(default: Any, help: str, low: float | None = None, high: float | None = None) -> Any:
+    return field(default=default, metadata={"help": help, "low": low, "high": high})
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to reconstruct one scan. Immutable; build from untrusted input with `from_dict`."""
+
+    calibrate: Calibrate = _knob(
+        "full", "full: every view's six degrees of freedom; static: the scanner's constant "
+        "errors only; none: trust the nominal geometry"
+    )  # fmt: skip
+    quality: Quality = _knob("normal", "preview stops at half resolution; fine runs longer")
+    splats: int | None = _knob(None, "Gaussians at full resolution; default: chosen from the volume", 100, 5_000_000)
+    dssim: float = _knob(0.0, "weight of the D-SSIM term of the loss beside L1", 0.0, 1.0)
+    seed: int = _knob(0, "seed of every random choice", 0, 2**31 - 1)
+    threads: int | None = _knob(None, "CPU threads; default: all this process may use", 1, 1024)
+
+    def __post_init__(self) -> None:
+        for name, kind in (("calibrate", Calibrate), ("quality", Quality)):
+            if getattr(self, name) not in get_args(kind):
+                raise OptionsError(
+                    f"{name}: got {getattr(self, name)!r}, expected one of {', '.join(get_args(kind))}"
+                )
+        for knob in dataclasses.fields(self):
+            value, low, high = getattr(self, knob.name), knob.metadata["low"], knob.metadata["high"]
+            if low is None or value is None:
+                continue
+            whole = knob.name != "dssim"
+            if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
+                raise OptionsError(f"{knob.name}: got {value!r}, expected a {'whole ' if whole else ''}number")
+            if not (math.isfinite(value) and low <= value <= high):
+                raise OptionsError(f"{knob.name}: got {value}, expected {low} to {high}")
+
+    @classmethod
+    def from_dict(cls, given: dict[str, Any]) -> Options:
+        """Options from parsed JSON. Raises OptionsError on an unknown name or a bad value."""
+        known = [knob.name for knob in dataclasses.fields(cls)]
+        unknown = sorted(set(given) - set(known))
+        if unknown:
+            raise OptionsError(f"unknown option {unknown[0]!r}; known: {', '.join(known)}")
+        return cls(**given)
+
+    def to_dict(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def describe() -> list[dict[str, Any]]:
+    """Each knob as a plain dict (name, default, choices, low, high, help), for forms and docs."""
+    choices = {"calibrate": list(get_args(Calibrate)), "quality": list(get_args(Quality))}
+    return [
+        {"name": k.name, "default": k.default, "choices": choices.get(k.name), **k.metadata}
+        for k in dataclasses.fields(Options)
+    ]
