@@ -1,0 +1,181 @@
+"""The client against a server in memory: retries, integrity, waiting, resuming."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import httpx
+import pytest
+from splatct_client import (
+    Client,
+    FileSpec,
+    InputError,
+    IntegrityError,
+    ResultFile,
+    ServerProblem,
+    ServerUnreachable,
+    UnexpectedAnswer,
+)
+
+JOB_ID = "6a1f6f0e-0000-4000-8000-000000000001"
+
+
+def upload_one(client: Client, source: Path | bytes, name: str = "a.tif") -> None:
+    upload = client.create_upload("scan", [FileSpec(name, 1)])
+    client.put_file(upload.id, name, source)
+
+
+def test_a_file_arrives_as_it_is_on_disk(client, api, tmp_path):
+    path = tmp_path / "a.tif"
+    path.write_bytes(bytes(range(256)) * 10000)
+    seen = []
+    upload = client.create_upload("scan", [FileSpec("a.tif", path.stat().st_size)])
+    stored = client.put_file(upload.id, "a.tif", path, seen.append)
+    assert api.uploads["a.tif"] == path.read_bytes()
+    assert stored.complete
+    assert seen == sorted(seen) and seen[-1] == path.stat().st_size and len(seen) > 2
+
+
+def test_a_name_with_odd_characters_arrives_as_it_is(client, api):
+    name = "Ränder/Projektion #1 50%?.tif"
+    upload_one(client, b"x", name)
+    assert api.uploads == {name: b"x"}
+
+
+@pytest.mark.parametrize("status", [429, 500, 502, 503, 504])
+def test_an_overloaded_server_is_asked_again(client, api, sleeps, status):
+    api.faults = [("PUT", (status, {}, b"")), ("PUT", (status, {}, b""))]
+    upload_one(client, b"data")
+    assert api.uploads["a.tif"] == b"data"
+    assert len(sleeps) == 2 and sleeps[1] > sleeps[0]
+
+
+def test_retry_after_is_honoured(client, api, sleeps):
+    api.faults = [("PUT", (429, {"Retry-After": "7"}, b""))]
+    upload_one(client, b"data")
+    assert sleeps == [7.0]
+
+
+def test_a_lost_connection_is_retried_with_the_whole_file(client, api):
+    api.faults = [("PUT", httpx.ReadError("reset"))]
+    upload_one(client, b"data" * 1000)
+    assert api.uploads["a.tif"] == b"data" * 1000
+
+
+def test_patience_ends(client, api, sleeps):
+    api.faults = [("PUT", (503, {}, b""))] * 100
+    with pytest.raises(ServerProblem, match="503") as caught:
+        upload_one(client, b"data")
+    assert caught.value.exit_code == 1
+    assert 30 < sum(sleeps) <= 60
+
+
+def test_a_job_is_never_submitted_twice(client, api):
+    client.options()
+    api.faults = [("POST /v1/jobs", httpx.ReadTimeout("slow"))]
+    with pytest.raises(ServerUnreachable):
+        client.submit("scan-1")
+    assert api.calls.count("POST /v1/jobs") == 1
+
+
+def test_a_server_that_never_answered_is_reported_at_once(client, api, sleeps):
+    api.faults = [("GET", httpx.ConnectError("Connection refused"))]
+    with pytest.raises(ServerUnreachable, match="splatct up"):
+        client.options()
+    assert sleeps == []
+
+
+def test_bytes_changed_on_the_way_are_noticed(client, api):
+    wrong = b'{"name": "a.tif", "size": 4, "sha256": "00"}'
+    api.faults = [("PUT", (200, {}, wrong))]
+    with pytest.raises(IntegrityError, match=r"a\.tif"):
+        upload_one(client, b"data")
+
+
+def test_every_listed_problem_is_told(client, api):
+    errors = [
+        {"where": "/geometry/dso_mm", "what": "got -1", "hint": "expected a length"},
+        {"where": "a.tif", "what": "cut"},
+    ]
+    body = {"type": "urn:splatct:problem:scan", "title": "The scan cannot be used", "status": 422, "errors": errors}
+    api.commit_answer = (422, {"Content-Type": "application/problem+json"}, httpx.Response(200, json=body).content)
+    with pytest.raises(ServerProblem) as caught:
+        client.commit("up-1")
+    text = str(caught.value)
+    assert "/geometry/dso_mm: got -1 (expected a length)" in text and "a.tif: cut" in text
+    assert caught.value.kind == "urn:splatct:problem:scan" and caught.value.exit_code == 2
+
+
+def test_an_error_without_problem_json_is_told_too(client, api):
+    api.faults = [("GET", (404, {"Content-Type": "text/html"}, b"<h1>nginx</h1>"))]
+    with pytest.raises(ServerProblem, match=r"Not Found.*404"):
+        client.options()
+
+
+def test_a_web_page_is_no_api(client, api):
+    api.faults = [("GET", (200, {"Content-Type": "text/html"}, b"<h1>hello</h1>"))]
+    with pytest.raises(UnexpectedAnswer, match="text/html"):
+        client.options()
+
+
+def test_waiting_tells_every_step(client, api):
+    seen = []
+    job = client.wait(JOB_ID, lambda job: seen.append(job.state))
+    assert job.finished and seen == ["queued", "running", "succeeded"]
+
+
+def test_waiting_outlives_a_restart_of_the_server(client, api):
+    client.options()
+    api.faults = [("GET /v1/jobs", httpx.ConnectError("refused"))] * 3
+    assert client.wait(JOB_ID).state == "succeeded"
+
+
+def test_a_download_is_whole_and_leaves_no_part(client, api, tmp_path):
+    api.results = {"volume.tif": b"v" * 5000}
+    (file,) = client.results(JOB_ID)
+    path = client.download(JOB_ID, file, tmp_path)
+    assert path.read_bytes() == b"v" * 5000
+    assert [p.name for p in tmp_path.iterdir()] == ["volume.tif"]
+
+
+def test_a_cut_download_goes_on_where_it_was(client, api, tmp_path):
+    data = bytes(range(256)) * 100
+    api.results, api.cut_download_at = {"volume.tif": data}, [10000, 20000]
+    (file,) = client.results(JOB_ID)
+    assert client.download(JOB_ID, file, tmp_path).read_bytes() == data
+    assert api.ranges == [None, "bytes=10000-", "bytes=20000-"]
+
+
+def test_the_piece_of_an_older_file_is_thrown_away(client, api, tmp_path):
+    api.results = {"volume.tif": b"new" * 1000}
+    (tmp_path / "volume.tif.part").write_bytes(b"old" * 10)
+    (file,) = client.results(JOB_ID)
+    assert client.download(JOB_ID, file, tmp_path).read_bytes() == b"new" * 1000
+    assert api.ranges == ["bytes=30-", None]
+
+
+def test_a_file_that_is_here_already_is_not_fetched(client, api, tmp_path):
+    api.results = {"volume.tif": b"v" * 100}
+    (file,) = client.results(JOB_ID)
+    client.download(JOB_ID, file, tmp_path)
+    client.download(JOB_ID, file, tmp_path)
+    assert len(api.ranges) == 1
+
+
+def test_a_result_with_the_wrong_digest_never_gets_its_name(client, api, tmp_path):
+    api.results = {"volume.tif": b"v" * 100}
+    with pytest.raises(IntegrityError, match="sha256"):
+        client.download(JOB_ID, ResultFile("volume.tif", 100, "0" * 64), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["../evil", "/etc/evil", "a/../../evil", "C:evil", "..\\evil", ""])
+def test_a_result_name_cannot_leave_the_folder(client, tmp_path, name):
+    with pytest.raises(UnexpectedAnswer, match="plain relative name"):
+        client.download(JOB_ID, ResultFile(name, 1, "0"), tmp_path / "out")
+
+
+@pytest.mark.parametrize("address", ["localhost:8080", "ftp://x", "", "http://"])
+def test_an_address_must_be_one(address):
+    with pytest.raises(InputError, match=r"http://127\.0\.0\.1:8080"):
+        Client(address)
