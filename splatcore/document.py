@@ -1,0 +1,196 @@
+"""Reading a JSON document from a stranger: load it within limits, pick typed values out of it, and
+note every problem with its JSON pointer instead of stopping at the first.
+
+Standard library only.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from splatcore.errors import Problem
+
+MAX_BYTES = 64 * 2**20
+_MAX_DEPTH = 64
+_MAX_PROBLEMS = 60
+_SHOWN = 60  # characters of an offending value that a message repeats
+
+
+def shown(value: object) -> str:
+    """A value as a message repeats it: JSON-like and short."""
+    try:
+        text = json.dumps(value)
+    except (TypeError, ValueError, RecursionError):
+        text = repr(value)
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+
+
+def nearest(given: str, known: Iterable[str]) -> str:
+    """A hint that names the closest known word, or all of them."""
+    known = list(known)
+    close = difflib.get_close_matches(given, known, n=1, cutoff=0.6)
+    if close:
+        return f"did you mean {close[0]!r}?"
+    return "known here: " + ", ".join(known) if known else ""
+
+
+class Document:
+    """The problems found so far, and readers of single values. A reader returns None after noting a problem."""
+
+    def __init__(self) -> None:
+        self.problems: list[Problem] = []
+        self._left_out = 0
+
+    def note(self, where: str, what: str, hint: str = "") -> None:
+        if len(self.problems) < _MAX_PROBLEMS:
+            self.problems.append(Problem(where, what, hint))
+        else:
+            self._left_out += 1
+
+    def all_problems(self) -> list[Problem]:
+        more = [Problem("", f"and {self._left_out} more problems", "mend these first")] if self._left_out else []
+        return self.problems + more
+
+    def load(self, path: Path) -> dict[str, Any] | None:
+        """The object in a JSON file, with finite numbers only and no key given twice."""
+        name = path.name
+        try:
+            size = path.stat().st_size
+            if size > MAX_BYTES:
+                self.note(name, f"is {size} bytes long, more than the {MAX_BYTES} allowed")
+                return None
+            text = path.read_bytes().decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            self.note(name, f"is not UTF-8 text (byte {error.start})", "save it as UTF-8")
+            return None
+        except OSError as error:
+            self.note(name, f"cannot be read: {error.strerror}")
+            return None
+        try:
+            data = json.loads(text, object_pairs_hook=self._unique)
+        except json.JSONDecodeError as error:
+            self.note(name, f"is not JSON: {error.msg} at line {error.lineno}, column {error.colno}")
+            return None
+        except RecursionError:
+            self.note(name, f"is nested deeper than {_MAX_DEPTH} levels")
+            return None
+        except ValueError as error:  # an integer with thousands of digits
+            self.note(name, f"is not usable JSON: {error}")
+            return None
+        if not isinstance(data, dict):
+            self.note(name, f"holds {shown(data)}, expected one object", "it must begin with '{'")
+            return None
+        self._walk(data, name)
+        return data
+
+    def _unique(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        result = dict(pairs)
+        if len(result) < len(pairs):
+            names = [key for key, _ in pairs]
+            for key in sorted({key for key in names if names.count(key) > 1}):
+                self.note("scan.json", f"gives the key {shown(key)} twice in one object", "keep one of them")
+        return result
+
+    def _walk(self, data: Any, name: str) -> None:
+        """Notes numbers that are not finite anywhere, and nesting that is too deep."""
+        stack: list[tuple[Any, str, int]] = [(data, "", 0)]
+        while stack:
+            value, pointer, depth = stack.pop()
+            if isinstance(value, float) and not math.isfinite(value):
+                self.note(pointer, f"got {value}, expected a finite number", "JSON knows neither NaN nor Infinity")
+            elif isinstance(value, dict | list):
+                if depth > _MAX_DEPTH:
+                    self.note(name, f"is nested deeper than {_MAX_DEPTH} levels")
+                    return None
+                items = value.items() if isinstance(value, dict) else enumerate(value)
+                stack += [(item, f"{pointer}/{key}", depth + 1) for key, item in items]
+
+    def object(
+        self, value: Any, pointer: str, required: Sequence[str], optional: Sequence[str] = ()
+    ) -> dict[str, Any] | None:
+        """An object with these keys and no others."""
+        if not isinstance(value, dict):
+            self.note(pointer, f"got {shown(value)}, expected an object")
+            return None
+        known = [*required, *optional]
+        for key in value:
+            if key not in known:
+                unused = [word for word in known if word not in value]
+                self.note(f"{pointer}/{key}", "unknown key", nearest(key, unused))
+        for key in required:
+            if key not in value:
+                self.note(f"{pointer}/{key}", "missing")
+        return value
+
+    def number(
+        self, value: Any, pointer: str, low: float = -math.inf, high: float = math.inf, unit: str = ""
+    ) -> float | None:
+        """A finite number from low to high."""
+        expected = f"a number from {low:g} to {high:g}" + (f" {unit}" if unit else "")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            self.note(pointer, f"got {shown(value)}, expected {expected}")
+            return None
+        if isinstance(value, float) and not math.isfinite(value):
+            return None  # noted by `load`
+        if not low <= value <= high:
+            self.note(pointer, f"got {shown(value)}, expected {expected}")
+            return None
+        return float(value)
+
+    def integer(self, value: Any, pointer: str, low: int, high: int) -> int | None:
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        if isinstance(value, float) and value.is_integer():
+            value, whole = int(value), True
+        if not whole or not low <= value <= high:
+            self.note(pointer, f"got {shown(value)}, expected a whole number from {low} to {high}")
+            return None
+        return int(value)
+
+    def array(self, value: Any, pointer: str, length: int | None = None, order: str = "") -> list[Any] | None:
+        """A list, of this length where one is given. `order` says what its items are: "[z, y, x]"."""
+        expected = f"a list of {length} items {order}".rstrip() if length is not None else "a list"
+        if not isinstance(value, list):
+            self.note(pointer, f"got {shown(value)}, expected {expected}")
+            return None
+        if length is not None and len(value) != length:
+            self.note(pointer, f"has {len(value)} items, expected {length} {order}".rstrip())
+            return None
+        return value
+
+    def numbers(
+        self,
+        value: Any,
+        pointer: str,
+        length: int | None = None,
+        low: float = -math.inf,
+        high: float = math.inf,
+        order: str = "",
+    ) -> list[float] | None:
+        """A list of finite numbers from low to high."""
+        items = self.array(value, pointer, length, order)
+        if items is None:
+            return None
+        read = [self.number(item, f"{pointer}/{i}", low, high) for i, item in enumerate(items)]
+        return None if None in read else [x for x in read if x is not None]
+
+    def text(self, value: Any, pointer: str, longest: int = 255) -> str | None:
+        """Non-empty text without control characters."""
+        if not isinstance(value, str) or not value.strip() or len(value) > longest:
+            self.note(pointer, f"got {shown(value)}, expected text of 1 to {longest} characters")
+            return None
+        if not value.isprintable():
+            self.note(pointer, f"got {shown(value)}, expected text without control characters")
+            return None
+        return value
+
+    def choice(self, value: Any, pointer: str, choices: Sequence[str]) -> str | None:
+        if value not in choices:
+            hint = nearest(value, choices) if isinstance(value, str) else ""
+            self.note(pointer, f"got {shown(value)}, expected one of {', '.join(choices)}", hint)
+            return None
+        return str(value)
