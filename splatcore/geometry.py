@@ -87,6 +87,10 @@ class Frames:
             q = q[..., :2] / q[..., 2:]
         return q[..., :2] + np.array([(self.cols - 1) / 2, (self.rows - 1) / 2])
 
+    def packed(self) -> Array:
+        """[views, 4, 3]: source (or ray), detector centre, u, v, as the core takes them."""
+        return np.ascontiguousarray(np.stack([self.source, self.detector_center, self.u, self.v], axis=1))
+
     def shifted_detector(self, columns: float, rows: float = 0.0) -> Frames:
         """The detector moved in its own plane, in pixels."""
         return replace(self, detector_center=self.detector_center + columns * self.u + rows * self.v)

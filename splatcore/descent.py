@@ -1,0 +1,73 @@
+"""Adam on the splats of one resolution level: one view a step, all arithmetic in the core."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatcore import _native
+from splatcore.geometry import Array
+from splatcore.splats import Floats, Splats
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam step sizes at the start of a level; all fall exponentially to `end` times that."""
+
+    mean: float = 0.05  # voxels of the level's grid
+    log_scale: float = 0.01
+    quat: float = 0.01
+    density: float = 0.02  # of the raw parameter, density = unit * softplus(raw)
+    end: float = 0.1
+
+
+class Descent:
+    """Splats under optimisation. `splats` shares memory with the live parameters."""
+
+    def __init__(
+        self,
+        splats: Splats,
+        rows: int,
+        cols: int,
+        *,
+        voxel_mm: float,
+        density_unit: float,
+        steps: int,
+        rates: Rates,
+        huber: float,
+        dssim: float,
+        data_range: float,
+        threads: int,
+    ) -> None:
+        self.renderer = _native.Renderer32(rows, cols, threads)
+        self._limits = (0.15 * voxel_mm, 20 * voxel_mm)
+        self._unit, self._steps, self._rates, self._voxel = density_unit, max(steps, 1), rates, voxel_mm
+        self._huber, self._dssim, self._range, self._threads = huber, dssim, data_range, threads
+        self._count = 0
+        self._first = np.zeros(11 * len(splats), np.float32)
+        self._second = np.zeros(11 * len(splats), np.float32)
+        self._gradient = splats.zeros_like()
+        self.replace(splats)
+
+    def replace(self, splats: Splats) -> None:
+        """Go on from these splats (moved by a gauge), keeping the moments."""
+        self.splats = Splats(*(np.ascontiguousarray(a, np.float32).copy() for a in splats.arrays()))
+        self._log_scales = np.log(self.splats.scales)
+        relative = np.maximum(self.splats.density / self._unit, 1e-6)
+        self._raw: Floats = np.where(relative > 20, relative, np.log(np.expm1(np.minimum(relative, 20)))).astype(np.float32)
+
+    def step(self, frame: Array, cone: bool, target: Floats, mask: Floats | None) -> float:
+        """One Adam step on one view. Returns the loss before it."""
+        s, g = self.splats, self._gradient
+        loss: float = self.renderer.loss_vjp(
+            frame, cone, *s.arrays(), target, mask, self._huber, self._dssim, self._range, *g.arrays()
+        )
+        decay = self._rates.end ** (self._count / self._steps)
+        self._count += 1
+        _native.adam(
+            s.means, self._log_scales, s.quats, self._raw, s.scales, s.density, self._first, self._second, *g.arrays(),
+            self._rates.mean * self._voxel * decay, self._rates.log_scale * decay, self._rates.quat * decay,
+            self._rates.density * decay, *self._limits, self._unit, self._count, self._threads,
+        )  # fmt: skip
+        return loss
