@@ -1,0 +1,70 @@
+"""Builds the application. No global app, no settings at import: `create_app(settings)`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+from fastapi import FastAPI
+from fastapi.staticfiles import StaticFiles
+
+from server import health, janitor, jobs, pages, problems, results, scans, uploads
+from server.dispatch import Dispatcher
+from server.guard import Guard
+from server.intake import Intake
+from server.reconcile import Reconciler, keep_reconciling
+from server.service import Service
+from server.settings import Settings
+from server.store import Store
+from worker.database import Database
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """The service for one data folder. Its background tasks run while the app's lifespan does."""
+    settings = settings.model_copy(update={"data": settings.data.absolute()})
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        (settings.data / "jobs").mkdir(parents=True, exist_ok=True)
+        database = Database(settings.database)
+        database.create_tables()
+        store, intake = Store(database), Intake(settings.data)
+        dispatcher = Dispatcher(settings.redis_url)
+        reconciler = Reconciler(store.jobs, dispatcher, settings.data)
+        loop, wake = asyncio.get_running_loop(), asyncio.Event()
+
+        def wake_up() -> None:
+            loop.call_soon_threadsafe(wake.set)
+
+        app.state.service = Service(settings, store, intake, wake_up)
+        app.state.dispatcher = dispatcher
+        tasks = [
+            asyncio.create_task(keep_reconciling(reconciler, settings.reconcile_s, wake)),
+            asyncio.create_task(janitor.keep_clean(store, intake, settings.data, settings.stale_upload_hours * 3600.0)),
+        ]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            dispatcher.close()
+            database.close()
+
+    app = FastAPI(
+        title="SplatCT",
+        version="1",
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+        separate_input_output_schemas=False,
+    )
+    problems.install(app)
+    app.add_middleware(Guard)
+    for part in (uploads, scans, jobs, results, health):
+        app.include_router(part.router)
+    app.include_router(pages.router)
+    app.mount("/static", StaticFiles(directory=Path(__file__).parent / "static"), name="static")
+    return app

@@ -1,0 +1,87 @@
+"""Stands before every route: body limits, host and origin checks, security headers.
+
+There are no keys yet, so the one thing between a web page on the internet and this API is the
+browser. Names other than loopback ones are refused (DNS rebinding), and so are writes that a browser
+marks as coming from another site.
+"""
+
+from __future__ import annotations
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from server.problems import response
+
+MIB = 1 << 20
+_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
+    "object-src 'none'; base-uri 'none'; frame-ancestors 'none'; form-action 'self'",
+}
+_LOCAL_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]", "::1"})
+
+
+class Guard:
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+
+        async def send_guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                for name, value in _HEADERS.items():
+                    MutableHeaders(scope=message).setdefault(name, value)
+            await send(message)
+
+        if _host_name(headers.get("host", "")) not in _LOCAL_NAMES:
+            refusal = response(421, "misdirected-request", "This server answers to its loopback name only.")
+        elif scope["method"] not in ("GET", "HEAD", "OPTIONS") and headers.get("sec-fetch-site") in (
+            "cross-site",
+            "same-site",
+        ):
+            refusal = response(403, "cross-site", "Requests from other web sites are refused.")
+        elif (limit := _body_limit(scope)) is not None and _declared(headers) > limit:
+            refusal = response(413, "content-too-large", f"The body may have at most {limit} bytes.")
+        else:
+            await self.app(scope, receive if limit is None else _limited(receive, limit), send_guarded)
+            return
+        await refusal(scope, receive, send_guarded)
+
+
+def _body_limit(scope: Scope) -> int | None:
+    """Files are streamed and have the size they announced as their limit; all else is small."""
+    if scope["method"] == "PUT" and scope["path"].startswith("/v1/uploads/"):
+        return None
+    return 16 * MIB if scope["path"] == "/v1/uploads" else MIB
+
+
+def _declared(headers: Headers) -> int:
+    length = headers.get("content-length", "0")
+    return int(length) if length.isdecimal() else 0
+
+
+def _limited(receive: Receive, limit: int) -> Receive:
+    seen = 0
+
+    async def counted() -> Message:
+        nonlocal seen
+        message = await receive()
+        seen += len(message.get("body", b""))
+        if seen > limit:
+            raise HTTPException(413)
+        return message
+
+    return counted
+
+
+def _host_name(host: str) -> str:
+    name, colon, port = host.rpartition(":")
+    return (name if colon and port.isdecimal() else host).lower()

@@ -1,0 +1,154 @@
+"""Uploaded bytes on disk: a file counts once all of it is durable under its final name.
+
+uploads/ID/parts/   files on their way, each writer with a name of its own
+uploads/ID/scan/    complete files; becomes scans/ID by one rename at commit
+uploads/ID/.lock    shared by writers, exclusive for a commit
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from uuid import uuid4
+
+from worker.jobfolder import sync_folder
+
+
+class Busy(Exception):
+    """The upload is being committed, or its files are still being written."""
+
+
+class Gone(Exception):
+    """The upload's folder is no longer there."""
+
+
+class Mismatch(Exception):
+    """The bytes are not the announced ones; the text says how."""
+
+
+class Arrival:
+    """One file on its way: write it chunk by chunk, then finish, then discard in any case."""
+
+    def __init__(self, parts: Path, size: int, expected_sha256: str | None) -> None:
+        self._path = parts / uuid4().hex
+        self._file = self._path.open("xb")
+        self._size = size
+        self._expected = expected_sha256
+        self._digest = hashlib.sha256()
+        self._received = 0
+
+    def write(self, chunk: bytes) -> None:
+        self._received += len(chunk)
+        if self._received > self._size:
+            raise Mismatch(f"more than the announced {self._size} bytes arrived")
+        self._digest.update(chunk)
+        self._file.write(chunk)
+
+    def complete(self) -> str:
+        """Check size and digest and make the bytes durable; returns the sha256."""
+        if self._received != self._size:
+            raise Mismatch(f"{self._received} bytes arrived, {self._size} were announced")
+        sha256 = self._digest.hexdigest()
+        if self._expected is not None and self._expected.lower() != sha256:
+            raise Mismatch("the sha256 of the bytes that arrived is not the announced one")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        return sha256
+
+    def move_to(self, path: Path) -> None:
+        self._path.replace(path)
+        sync_folder(path.parent)
+
+    def discard(self) -> None:
+        self._file.close()
+        self._path.unlink(missing_ok=True)
+
+
+class Intake:
+    def __init__(self, data: Path) -> None:
+        self._uploads = data / "uploads"
+        self._scans = data / "scans"
+        for folder in (self._uploads, self._scans):
+            folder.mkdir(parents=True, exist_ok=True)
+        self._settling = threading.Lock()  # keeps file and database row of one name in step
+
+    def scan_folder(self, scan_id: str) -> Path:
+        return self._scans / scan_id
+
+    def open_folder(self, upload_id: str) -> Path:
+        """Where the complete files of an open upload lie; the scan's own folder if a commit was cut short."""
+        folder = self._uploads / upload_id / "scan"
+        return folder if folder.is_dir() else self._scans / upload_id
+
+    def create(self, upload_id: str) -> None:
+        for name in ("parts", "scan"):
+            (self._uploads / upload_id / name).mkdir(parents=True)
+        (self._uploads / upload_id / ".lock").touch()
+
+    @contextlib.contextmanager
+    def writing(self, upload_id: str) -> Iterator[Path]:
+        """For receiving a file; yields the folder for parts."""
+        with self._locked(upload_id, fcntl.LOCK_SH, 0.0):
+            yield self._uploads / upload_id / "parts"
+
+    @contextlib.contextmanager
+    def alone(self, upload_id: str, wait_s: float) -> Iterator[None]:
+        """For committing or deleting: nobody writes meanwhile."""
+        with self._locked(upload_id, fcntl.LOCK_EX, wait_s):
+            yield
+
+    def settle(self, upload_id: str, name: str, arrival: Arrival, record: Callable[[], None]) -> None:
+        """Give a complete file its name and record it, as one step towards other writers of that name."""
+        with self._settling:
+            arrival.move_to(self._uploads / upload_id / "scan" / name)
+            record()
+
+    def promote(self, upload_id: str) -> None:
+        """Turn the files of an upload into a scan. Harmless when that has been done."""
+        source, target = self._uploads / upload_id / "scan", self._scans / upload_id
+        if source.is_dir():
+            source.rename(target)
+            sync_folder(target.parent)
+            sync_folder(source.parent)
+
+    def remove_upload(self, upload_id: str) -> None:
+        shutil.rmtree(self._uploads / upload_id, ignore_errors=True)
+
+    def remove_scan(self, scan_id: str) -> None:
+        doomed = self._scans / f".deleted-{scan_id}"
+        with contextlib.suppress(FileNotFoundError):
+            (self._scans / scan_id).rename(doomed)
+        shutil.rmtree(doomed, ignore_errors=True)
+
+    def upload_folders(self) -> list[str]:
+        return [folder.name for folder in self._uploads.iterdir()]
+
+    def scan_folders(self) -> list[str]:
+        return [folder.name for folder in self._scans.iterdir()]
+
+    @contextlib.contextmanager
+    def _locked(self, upload_id: str, how: int, wait_s: float) -> Iterator[None]:
+        try:
+            descriptor = os.open(self._uploads / upload_id / ".lock", os.O_RDWR)
+        except FileNotFoundError:
+            raise Gone from None
+        deadline = time.monotonic() + wait_s
+        try:
+            while True:
+                try:
+                    fcntl.flock(descriptor, how | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if time.monotonic() >= deadline:
+                        raise Busy from None
+                    time.sleep(0.05)
+            yield
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,112 @@
+"""Routes about jobs: submit, watch, cancel, forget."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+from uuid import UUID, uuid4
+
+from fastapi import APIRouter, Query, Response
+from fastapi.responses import FileResponse, PlainTextResponse
+
+from server.problems import ApiProblem, invalid, not_found
+from server.schema import EventList, JobIn, JobList, JobOut
+from server.service import Served, Service
+from splatcore.errors import OptionsError, Problem
+from splatcore.options import Options, describe
+from worker.contract import FINISHED, State
+from worker.journal import read_events
+from worker.ledger import Job
+
+router = APIRouter(prefix="/v1", tags=["jobs"])
+
+MOST_EVENTS = 5000
+_POLL_S = {State.QUEUED: 5}  # all others: 1
+
+
+@router.get("/options")
+def get_options() -> dict[str, list[dict[str, Any]]]:
+    return {"options": describe()}
+
+
+@router.post("/jobs", status_code=202)
+def submit_job(body: JobIn, service: Served, response: Response) -> JobOut:
+    scan = service.store.scan(str(body.scan_id))
+    if scan is None:
+        raise invalid("There is no such scan.", [Problem("scan_id", "names no committed scan")])
+    try:
+        options = Options.from_dict(body.options)
+    except OptionsError as error:
+        raise invalid("An option cannot be used.", [Problem("options", str(error))]) from None
+    job_id = str(uuid4())
+    folder = service.folder(job_id)
+    try:
+        folder.create(service.intake.scan_folder(scan.id))
+        queued = service.store.add_job(job_id, body.name or scan.name, scan, options.to_dict())
+    except FileNotFoundError:
+        queued = False
+    if not queued:
+        folder.remove()
+        raise invalid("There is no such scan.", [Problem("scan_id", "was deleted just now")])
+    service.wake()
+    response.headers["Location"] = f"/v1/jobs/{job_id}"
+    return _answer(service, service.job(UUID(job_id)), response)
+
+
+@router.get("/jobs")
+def list_jobs(
+    service: Served,
+    state: State | None = None,
+    limit: Annotated[int, Query(ge=1, le=500)] = 50,
+    before: UUID | None = None,
+) -> JobList:
+    """Newest first. `before` is the id of a job; older ones are listed."""
+    jobs = service.store.jobs.page(state, limit + 1, None if before is None else service.job(before))
+    more = len(jobs) > limit
+    jobs = jobs[:limit]
+    return JobList(jobs=[_out(service, job) for job in jobs], next=jobs[-1].id if more else None)
+
+
+@router.get("/jobs/{job_id}")
+def get_job(job_id: UUID, service: Served, response: Response) -> JobOut:
+    return _answer(service, service.job(job_id), response)
+
+
+@router.post("/jobs/{job_id}/cancel", status_code=202)
+def cancel_job(job_id: UUID, service: Served, response: Response) -> JobOut:
+    job = service.store.jobs.ask_cancel(str(job_id))
+    if job is None:
+        raise not_found("job")
+    return _answer(service, job, response)
+
+
+@router.delete("/jobs/{job_id}", status_code=204)
+def delete_job(job_id: UUID, service: Served) -> None:
+    service.job(job_id)
+    if not service.store.jobs.forget(str(job_id)):
+        raise ApiProblem(409, "not-finished", "The job has not finished; cancel it first.")
+    service.folder(str(job_id)).remove()
+
+
+@router.get("/jobs/{job_id}/events")
+def get_events(job_id: UUID, service: Served, after: Annotated[int, Query(ge=0)] = 0) -> EventList:
+    """Events numbered above `after`, at most 5000 at a time."""
+    events = read_events(service.folder(service.job(job_id).id).events, after, MOST_EVENTS)
+    return EventList(events=events, last=events[-1]["number"] if events else after)
+
+
+@router.get("/jobs/{job_id}/log", response_class=PlainTextResponse)
+def get_log(job_id: UUID, service: Served) -> Response:
+    log = service.folder(service.job(job_id).id).log
+    if not log.exists():
+        return PlainTextResponse("")
+    return FileResponse(log, media_type="text/plain")
+
+
+def _out(service: Service, job: Job) -> JobOut:
+    return JobOut.of(job, service.store.jobs.position(job) if job.state is State.QUEUED else None)
+
+
+def _answer(service: Service, job: Job, response: Response) -> JobOut:
+    if job.state not in FINISHED:
+        response.headers["Retry-After"] = str(_POLL_S.get(job.state, 1))
+    return _out(service, job)

@@ -1,0 +1,98 @@
+"""Errors on the wire: RFC 9457 `application/problem+json`, whatever went wrong.
+
+Nothing of the request is echoed and no traceback leaves the process.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from splatcore.errors import Problem
+
+log = logging.getLogger("splatct.server")
+
+
+class ApiProblem(Exception):
+    """Raised by a route to answer with a problem."""
+
+    def __init__(
+        self,
+        status: int,
+        name: str,
+        detail: str,
+        errors: Sequence[Problem] = (),
+        retry_after_s: int | None = None,
+    ) -> None:
+        super().__init__(detail)
+        self.status = status
+        self.name = name
+        self.detail = detail
+        self.errors = tuple(errors)
+        self.headers = {} if retry_after_s is None else {"Retry-After": str(retry_after_s)}
+
+
+def not_found(what: str) -> ApiProblem:
+    return ApiProblem(404, "not-found", f"There is no such {what}.")
+
+
+def invalid(detail: str, errors: Sequence[Problem] = ()) -> ApiProblem:
+    return ApiProblem(422, "invalid", detail, errors)
+
+
+def response(
+    status: int, name: str, detail: str, errors: Sequence[Problem] = (), headers: dict[str, str] | None = None
+) -> JSONResponse:
+    body: dict[str, Any] = {
+        "type": f"urn:splatct:problem:{name}",
+        "title": name.replace("-", " ").capitalize(),
+        "status": status,
+        "detail": detail,
+    }
+    if errors:
+        body["errors"] = [error.to_json() for error in errors]
+    return JSONResponse(body, status, headers, media_type="application/problem+json")
+
+
+async def _on_problem(_request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, ApiProblem)
+    return response(error.status, error.name, error.detail, error.errors, error.headers)
+
+
+async def _on_http(_request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    phrase = HTTPStatus(error.status_code).phrase
+    headers = dict(error.headers) if error.headers else None
+    return response(error.status_code, phrase.lower().replace(" ", "-"), f"{phrase}.", headers=headers)
+
+
+async def _on_invalid(_request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    errors = [Problem(_pointer(one["loc"]), str(one["msg"])) for one in error.errors()]
+    return response(422, "invalid", "The request is not what this call expects.", errors)
+
+
+async def _on_bug(request: Request, error: Exception) -> JSONResponse:
+    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    return response(500, "internal-error", "The server failed; its log says more.")
+
+
+def _pointer(where: Sequence[str | int]) -> str:
+    """("body", "files", 0, "size") as body/files/0/size. Unknown field names are the caller's own words,
+    so only short plain ones are repeated."""
+    parts = [str(part) for part in where]
+    return "/".join(part if len(part) <= 64 and part.isprintable() else "…" for part in parts)
+
+
+def install(app: FastAPI) -> None:
+    app.add_exception_handler(ApiProblem, _on_problem)
+    app.add_exception_handler(HTTPException, _on_http)
+    app.add_exception_handler(RequestValidationError, _on_invalid)
+    app.add_exception_handler(Exception, _on_bug)

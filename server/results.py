@@ -1,0 +1,81 @@
+"""Routes that hand out what a job made."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any, Literal
+from uuid import UUID
+
+from fastapi import APIRouter, Path, Query, Response
+from fastapi.responses import FileResponse
+
+from server import names, slices
+from server.problems import ApiProblem, invalid, not_found
+from server.service import Served, Service
+from worker.contract import State
+from worker.jobfolder import JobFolder
+
+router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
+
+_FOREVER = {"Cache-Control": "private, max-age=86400, immutable"}
+_REVALIDATE = {"Cache-Control": "private, no-cache"}
+
+
+@router.get("/results")
+def get_manifest(job_id: UUID, service: Served) -> Any:
+    return _json(_finished(service, job_id), "manifest.json")
+
+
+@router.get("/report")
+def get_report(job_id: UUID, service: Served) -> Any:
+    return _json(_finished(service, job_id), "report.json")
+
+
+@router.get("/results/{file}", response_class=FileResponse)
+def get_result(job_id: UUID, file: Annotated[str, Path(max_length=255)], service: Served) -> Response:
+    folder = _finished(service, job_id)
+    path = folder.results / file
+    if names.fault(file) is not None or path.is_symlink() or not path.is_file():
+        raise not_found("result file")
+    if file.endswith(".html"):  # shown in the browser: made by the engine, but with the user's words in it
+        sandbox = {"Content-Security-Policy": "sandbox allow-scripts; default-src 'none'; img-src data:; "
+                   "style-src 'unsafe-inline'; script-src 'unsafe-inline'"}  # fmt: skip
+        return FileResponse(path, headers={**_REVALIDATE, **sandbox})
+    return FileResponse(path, filename=file, headers=_REVALIDATE)
+
+
+@router.get("/slices/{axis}/{index}.png", response_class=Response, responses={200: {"content": {"image/png": {}}}})
+def get_slice(
+    job_id: UUID,
+    axis: Literal["x", "y", "z"],
+    index: Annotated[int, Path(ge=0)],
+    service: Served,
+    low: Annotated[float | None, Query(allow_inf_nan=False)] = None,
+    high: Annotated[float | None, Query(allow_inf_nan=False)] = None,
+) -> Response:
+    """One slice as an 8-bit PNG; z up for x and y, y up for z. `low` and `high` are in 1/mm."""
+    folder = _finished(service, job_id)
+    if low is not None and high is not None and not low < high:
+        raise invalid("low must be less than high.")
+    try:
+        png = slices.render(folder, axis, index, low, high)
+    except IndexError:
+        raise not_found("slice") from None
+    except FileNotFoundError:
+        raise not_found("volume") from None
+    return Response(png, media_type="image/png", headers=_FOREVER)
+
+
+def _finished(service: Service, job_id: UUID) -> JobFolder:
+    """The folder of a job that has results, or a 404 or 409."""
+    job = service.job(job_id)
+    if job.state is not State.SUCCEEDED:
+        raise ApiProblem(409, "no-results", f"The job has no results: it is {job.state}.")
+    return service.folder(job.id)
+
+
+def _json(folder: JobFolder, name: str) -> Any:
+    try:
+        return json.loads((folder.results / name).read_bytes())
+    except FileNotFoundError:
+        raise not_found("result file") from None

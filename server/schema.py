@@ -1,0 +1,148 @@
+"""The wire: what the API takes and gives. docs/http.md in types; the only definition of them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated, Any
+from uuid import UUID
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from worker.contract import State
+from worker.ledger import Job
+
+Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
+
+
+class Body(BaseModel):
+    """Base of request bodies: unknown fields are refused."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class FileIn(Body):
+    name: Annotated[str, Field(min_length=1, max_length=1024)]
+    size: Annotated[int, Field(ge=1, le=1 << 50, description="bytes")]
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-fA-F]{64}$")] | None = None
+
+
+class UploadIn(Body):
+    name: Name
+    files: Annotated[list[FileIn], Field(min_length=1, max_length=50_000)]
+
+
+class JobIn(Body):
+    scan_id: UUID
+    options: dict[str, Any] = Field(default_factory=dict, description="see GET /v1/options")
+    name: Name | None = None
+
+
+class FileOut(BaseModel):
+    name: str
+    size: int
+    received: int
+    complete: bool
+    sha256: str | None = Field(description="of the bytes received; null until complete")
+
+
+class UploadOut(BaseModel):
+    id: str
+    name: str
+    state: str = Field(description="open or committed")
+    files: list[FileOut]
+    scan_id: str | None
+    created_at: datetime
+    links: dict[str, str]
+
+
+class ScanOut(BaseModel):
+    id: str
+    name: str
+    bytes: int
+    facts: dict[str, Any]
+    created_at: datetime
+    links: dict[str, str]
+
+
+class ScanList(BaseModel):
+    scans: list[ScanOut]
+
+
+class ErrorOut(BaseModel):
+    kind: str
+    message: str
+
+
+class JobOut(BaseModel):
+    id: str
+    name: str
+    scan_id: str
+    scan_name: str
+    state: State
+    stage: str
+    message: str
+    progress: float = Field(ge=0, le=1)
+    eta_s: float | None
+    queue_position: int | None = Field(description="1 is next; null unless queued")
+    attempt: int
+    options: dict[str, Any]
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    error: ErrorOut | None
+    links: dict[str, str]
+
+    @classmethod
+    def of(cls, job: Job, position: int | None) -> JobOut:
+        error = None if job.error_kind is None else ErrorOut(kind=job.error_kind, message=job.error_message or "")
+        return cls(
+            id=job.id,
+            name=job.name,
+            scan_id=job.scan_id,
+            scan_name=job.scan_name,
+            state=job.state,
+            stage=job.stage,
+            message=job.message,
+            progress=job.progress,
+            eta_s=job.eta_s,
+            queue_position=position,
+            attempt=job.attempt,
+            options=job.options,
+            created_at=moment(job.created_at),
+            started_at=None if job.started_at is None else moment(job.started_at),
+            finished_at=None if job.finished_at is None else moment(job.finished_at),
+            error=error,
+            links=_job_links(job),
+        )
+
+
+class JobList(BaseModel):
+    jobs: list[JobOut]
+    next: str | None = Field(description="give it as `before` for the next page; null on the last")
+
+
+class EventList(BaseModel):
+    events: list[dict[str, Any]] = Field(description="progress events with number, at, attempt, stage, fraction, …")
+    last: int = Field(description="number of the last event given; pass it as `after` next time")
+
+
+class Readiness(BaseModel):
+    ready: bool
+    database: bool
+    redis: bool
+    disk: bool
+    workers: int
+
+
+def moment(seconds: float) -> datetime:
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+def _job_links(job: Job) -> dict[str, str]:
+    base = f"/v1/jobs/{job.id}"
+    links = {"self": base, "scan": f"/v1/scans/{job.scan_id}", "events": f"{base}/events", "log": f"{base}/log"}
+    if job.state is State.SUCCEEDED:
+        links |= {"results": f"{base}/results", "report": f"{base}/report"}
+    elif job.state in (State.QUEUED, State.RUNNING):
+        links["cancel"] = f"{base}/cancel"
+    return links

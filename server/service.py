@@ -1,0 +1,43 @@
+"""What the routes share: settings, database, folders. One instance per app, made at start-up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated
+from uuid import UUID
+
+from fastapi import Depends, Request
+
+from server.intake import Intake
+from server.problems import not_found
+from server.settings import Settings
+from server.store import Store
+from worker.jobfolder import JobFolder
+from worker.ledger import Job
+
+
+@dataclass
+class Service:
+    settings: Settings
+    store: Store
+    intake: Intake
+    wake: Callable[[], None]  # have the reconcile loop look at once
+
+    def folder(self, job_id: str) -> JobFolder:
+        return JobFolder(self.settings.data, job_id)
+
+    def job(self, job_id: UUID) -> Job:
+        """The job, or a 404."""
+        job = self.store.jobs.get(str(job_id))
+        if job is None:
+            raise not_found("job")
+        return job
+
+
+def _service(request: Request) -> Service:
+    service: Service = request.app.state.service
+    return service
+
+
+Served = Annotated[Service, Depends(_service)]

@@ -1,0 +1,38 @@
+"""The server's settings, from `SPLATCT_*` environment variables. Read on use, never at import."""
+
+from __future__ import annotations
+
+import ipaddress
+
+from splatcore.errors import SplatCTError
+from worker.settings import WorkerSettings
+
+MIB = 1 << 20
+
+
+class SettingsError(SplatCTError):
+    """A setting cannot be used."""
+
+
+class Settings(WorkerSettings):
+    host: str = "127.0.0.1"
+    port: int = 8080
+    check: str = "splatcore.check"  # for tests: the module that judges an uploaded scan
+    check_memory_mib: int = 8192  # address space of that check; a hostile TIFF gets no further
+    disk_floor_mib: int = 512  # kept free: no upload may take the last of the disk
+    stale_upload_hours: float = 48.0
+    reconcile_s: float = 2.0
+
+    def require_loopback(self) -> None:
+        """Refuse an address others could reach: there are no keys yet, so whoever connects may do all."""
+        if self.host == "localhost":
+            return
+        try:
+            safe = ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            safe = False
+        if not safe:
+            raise SettingsError(
+                f"host: got {self.host!r}, expected a loopback address such as 127.0.0.1. The API has no "
+                "authentication yet; to reach it from elsewhere use an SSH tunnel or an authenticating proxy."
+            )

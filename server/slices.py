@@ -1,0 +1,64 @@
+"""Slices of a reconstructed volume as PNG pictures, read from disk without loading the volume."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from PIL import Image
+
+from worker.jobfolder import JobFolder, write_atomically
+
+_SAMPLE = 2_000_000  # voxels looked at for the grey window
+_PERCENTILES = (0.5, 99.5)
+_AXES = {"z": 0, "y": 1, "x": 2}
+
+
+def render(folder: JobFolder, axis: str, index: int, low: float | None, high: float | None) -> bytes:
+    """Slice `index` along `axis`. Raises IndexError outside the volume, FileNotFoundError without one."""
+    volume = _volume(folder.results / "volume.tif")
+    plane = volume[(slice(None),) * _AXES[axis] + (index,)]
+    if low is None or high is None:
+        auto_low, auto_high = _window(folder, volume)
+        low = auto_low if low is None else low
+        high = auto_high if high is None else high
+    return _png(np.asarray(plane, np.float32)[::-1], low, high)
+
+
+def _volume(path: Path) -> Any:
+    """The volume [z, y, x], mapped. Our own engine wrote it, plain and contiguous."""
+    if not path.is_file():
+        raise FileNotFoundError(path)
+    with tifffile.TiffFile(path, is_ome=False) as tiff:
+        page = tiff.pages.first
+        rows, columns = page.shape
+        shape = (len(tiff.pages), rows, columns)
+        assert page.dtype is not None
+        offset, dtype = page.dataoffsets[0], page.dtype.newbyteorder(tiff.byteorder)
+    return np.memmap(path, dtype, "r", offset, shape)
+
+
+def _window(folder: JobFolder, volume: Any) -> tuple[float, float]:
+    """The default grey window: most of the volume's own range. Computed once, kept beside the results."""
+    cache = folder.path / "window.json"
+    try:
+        kept = json.loads(cache.read_bytes())
+        return float(kept["low"]), float(kept["high"])
+    except (FileNotFoundError, ValueError, KeyError):
+        pass
+    step = max(1, round((volume.size / _SAMPLE) ** (1 / 3)))
+    low, high = (float(value) for value in np.percentile(volume[::step, ::step, ::step], _PERCENTILES))
+    write_atomically(cache, json.dumps({"low": low, "high": high}).encode())
+    return low, high
+
+
+def _png(plane: np.ndarray[Any, np.dtype[np.float32]], low: float, high: float) -> bytes:
+    scaled = (plane - low) * (255.0 / max(high - low, 1e-30))
+    grey = np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8)
+    out = io.BytesIO()
+    Image.fromarray(grey).save(out, "PNG", compress_level=3)
+    return out.getvalue()

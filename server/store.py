@@ -1,0 +1,190 @@
+"""Uploads and scans in the database, beside the jobs table of `worker.ledger`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+from uuid import uuid4
+
+import sqlalchemy as sa
+
+from worker.database import Database, metadata
+from worker.ledger import Ledger
+
+uploads = sa.Table(
+    "uploads",
+    metadata,
+    sa.Column("id", sa.String(36), primary_key=True),
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("committed", sa.Boolean, nullable=False, default=False),
+    sa.Column("created_at", sa.Float, nullable=False),
+    sa.Column("touched_at", sa.Float, nullable=False),
+)
+
+files = sa.Table(
+    "upload_files",
+    metadata,
+    sa.Column("upload_id", sa.String(36), sa.ForeignKey("uploads.id", ondelete="CASCADE"), primary_key=True),
+    sa.Column("name", sa.String(255), primary_key=True),
+    sa.Column("position", sa.Integer, nullable=False),
+    sa.Column("size", sa.BigInteger, nullable=False),
+    sa.Column("expected_sha256", sa.String(64)),
+    sa.Column("sha256", sa.String(64)),  # of the bytes on disk; null until complete
+)
+
+scans = sa.Table(
+    "scans",
+    metadata,
+    sa.Column("id", sa.String(36), primary_key=True),  # that of its upload
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("bytes", sa.BigInteger, nullable=False),
+    sa.Column("facts", sa.JSON, nullable=False),
+    sa.Column("created_at", sa.Float, nullable=False, index=True),
+)
+
+
+@dataclass(frozen=True)
+class File:
+    name: str
+    size: int
+    expected_sha256: str | None
+    sha256: str | None
+
+
+@dataclass(frozen=True)
+class Upload:
+    id: str
+    name: str
+    committed: bool
+    created_at: float
+    files: tuple[File, ...]
+
+    def missing(self) -> list[str]:
+        return [file.name for file in self.files if file.sha256 is None]
+
+
+@dataclass(frozen=True)
+class Scan:
+    id: str
+    name: str
+    bytes: int
+    facts: dict[str, Any]
+    created_at: float
+
+
+class Store:
+    """Everything the server keeps, on one database."""
+
+    def __init__(self, database: Database) -> None:
+        self.database = database
+        self.jobs = Ledger(database)
+
+    # Uploads
+
+    def add_upload(self, name: str, announced: Sequence[File]) -> Upload:
+        upload_id, now = str(uuid4()), time.time()
+        rows = [
+            {
+                "upload_id": upload_id,
+                "position": n,
+                "name": f.name,
+                "size": f.size,
+                "expected_sha256": f.expected_sha256,
+            }
+            for n, f in enumerate(announced)
+        ]
+        with self.database.writing() as write:
+            write.execute(
+                uploads.insert().values(id=upload_id, name=name, committed=False, created_at=now, touched_at=now)
+            )
+            write.execute(files.insert(), rows)
+        return Upload(upload_id, name, False, now, tuple(announced))
+
+    def upload(self, upload_id: str) -> Upload | None:
+        columns = (files.c.name, files.c.size, files.c.expected_sha256, files.c.sha256)
+        with self.database.reading() as read:
+            row = read.execute(sa.select(uploads).where(uploads.c.id == upload_id)).one_or_none()
+            if row is None:
+                return None
+            query = sa.select(*columns).where(files.c.upload_id == upload_id).order_by(files.c.position)
+            announced = tuple(File(*file) for file in read.execute(query))
+        return Upload(row.id, row.name, row.committed, row.created_at, announced)
+
+    def upload_file(self, upload_id: str, name: str) -> tuple[bool, File] | None:
+        """Whether the upload is committed, and one of its files."""
+        query = (
+            sa.select(uploads.c.committed, files.c.name, files.c.size, files.c.expected_sha256, files.c.sha256)
+            .join_from(files, uploads)
+            .where(files.c.upload_id == upload_id, files.c.name == name)
+        )
+        with self.database.reading() as read:
+            row = read.execute(query).one_or_none()
+        return None if row is None else (row.committed, File(*row[1:]))
+
+    def received(self, upload_id: str, name: str, sha256: str) -> None:
+        mine = sa.and_(files.c.upload_id == upload_id, files.c.name == name)
+        with self.database.writing() as write:
+            write.execute(files.update().where(mine).values(sha256=sha256))
+            write.execute(uploads.update().where(uploads.c.id == upload_id).values(touched_at=time.time()))
+
+    def outstanding_bytes(self) -> int:
+        """Announced by open uploads and not yet here: disk that is spoken for."""
+        query = sa.select(sa.func.coalesce(sa.func.sum(files.c.size), 0)).join_from(files, uploads)
+        with self.database.reading() as read:
+            return int(read.execute(query.where(~uploads.c.committed, files.c.sha256.is_(None))).scalar_one())
+
+    def stale_uploads(self, before: float) -> list[str]:
+        query = sa.select(uploads.c.id).where(~uploads.c.committed, uploads.c.touched_at < before)
+        with self.database.reading() as read:
+            return list(read.execute(query).scalars())
+
+    def drop_upload(self, upload_id: str) -> bool:
+        """Forget an open upload."""
+        is_open = sa.and_(uploads.c.id == upload_id, ~uploads.c.committed)
+        with self.database.writing() as write:
+            if write.execute(uploads.select().where(is_open)).first() is None:
+                return False
+            write.execute(files.delete().where(files.c.upload_id == upload_id))
+            write.execute(uploads.delete().where(is_open))
+            return True
+
+    # Scans
+
+    def commit(self, upload: Upload, facts: dict[str, Any]) -> Scan:
+        scan = Scan(upload.id, upload.name, sum(file.size for file in upload.files), facts, time.time())
+        with self.database.writing() as write:
+            write.execute(uploads.update().where(uploads.c.id == upload.id).values(committed=True))
+            write.execute(scans.insert().values(**vars(scan)))
+        return scan
+
+    def scan(self, scan_id: str) -> Scan | None:
+        with self.database.reading() as read:
+            row = read.execute(sa.select(scans).where(scans.c.id == scan_id)).one_or_none()
+        return None if row is None else Scan(*row)
+
+    def scans(self) -> list[Scan]:
+        query = sa.select(scans).order_by(scans.c.created_at.desc(), scans.c.id).limit(1000)
+        with self.database.reading() as read:
+            return [Scan(*row) for row in read.execute(query)]
+
+    def drop_scan(self, scan_id: str) -> bool:
+        """Forget a scan, and the upload it came from; False while a job needs it."""
+        with self.database.writing() as write:
+            if self.jobs.needs_scan(write, scan_id):
+                return False
+            write.execute(scans.delete().where(scans.c.id == scan_id))
+            write.execute(files.delete().where(files.c.upload_id == scan_id))
+            write.execute(uploads.delete().where(uploads.c.id == scan_id))
+            return True
+
+    # Jobs
+
+    def add_job(self, job_id: str, name: str, scan: Scan, options: dict[str, Any]) -> bool:
+        """Queue a job; False if the scan was deleted meanwhile. One transaction with `drop_scan`'s check."""
+        with self.database.writing() as write:
+            if write.execute(sa.select(scans.c.id).where(scans.c.id == scan.id)).first() is None:
+                return False
+            self.jobs.add(write, job_id, name, (scan.id, scan.name), options)
+            return True

@@ -1,0 +1,46 @@
+"""`splatct server`: the HTTP service alone; workers and Redis run elsewhere."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+HELP = "run the HTTP service (workers are started separately)"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", type=Path, help="the data folder (SPLATCT_DATA, default ./splatct-data)")
+    parser.add_argument("--host", help="loopback address to listen on (SPLATCT_HOST, default 127.0.0.1)")
+    parser.add_argument("--port", type=int, help="port to listen on (SPLATCT_PORT, default 8080)")
+    parser.add_argument("--tie-to", type=int, metavar="PID", help=argparse.SUPPRESS)  # for `splatct up`
+
+
+def run(args: argparse.Namespace) -> int:
+    import logging
+    import os
+    import signal
+
+    import uvicorn
+
+    from server.app import create_app
+    from server.settings import Settings
+    from worker.lifeline import die_with_parent
+
+    if args.tie_to is not None:
+        die_with_parent(args.tie_to, signal.SIGTERM)
+    given = {name: getattr(args, name) for name in ("data", "host", "port")}
+    settings = Settings(**{name: value for name, value in given.items() if value is not None})
+    settings.require_loopback()
+    os.umask(0o077)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    logging.getLogger("splatct.server").info("http://%s:%d, data in %s", settings.host, settings.port, settings.data)
+    uvicorn.run(
+        create_app(settings),
+        host=settings.host,
+        port=settings.port,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=5,
+    )
+    return 0

@@ -1,0 +1,68 @@
+"""What server and worker agree on: job states, their legal transitions, names on the queue.
+
+Standard library only. The table below is the whole state machine; `worker.ledger` refuses
+every change it does not list.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, StrEnum
+
+QUEUE = "splatct"
+TASK = "worker.supervise.run_job"
+
+MAX_CRASHES = 3  # attempts that may die before the job is given up; hand-backs do not count
+HEARTBEAT_S = 2.0  # how often a supervisor marks its row
+DEAD_S = 8.0  # a heartbeat older than this, on another host, is a dead worker
+STUCK_S = 60.0  # on this host, where the lock still proves life, wait this long instead
+
+
+class State(StrEnum):
+    QUEUED = "queued"
+    RUNNING = "running"
+    CANCELLING = "cancelling"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+TRANSITIONS: dict[State, frozenset[State]] = {
+    State.QUEUED: frozenset({State.RUNNING, State.CANCELLED, State.FAILED}),
+    State.RUNNING: frozenset({State.QUEUED, State.CANCELLING, State.SUCCEEDED, State.FAILED}),
+    # A cancellation that was accepted always ends as one, even if the engine finished meanwhile.
+    State.CANCELLING: frozenset({State.CANCELLED}),
+    State.SUCCEEDED: frozenset(),
+    State.FAILED: frozenset(),
+    State.CANCELLED: frozenset(),
+}
+
+FINISHED = frozenset(state for state, onward in TRANSITIONS.items() if not onward)
+ACTIVE = frozenset(State) - FINISHED
+
+
+class ErrorKind(StrEnum):
+    """Why a job failed: stable words for programs; the message is for people."""
+
+    BAD_INPUT = "bad_input"
+    CANNOT_RECONSTRUCT = "cannot_reconstruct"
+    OUT_OF_MEMORY = "out_of_memory"
+    DISK_FULL = "disk_full"
+    TIMEOUT = "timeout"
+    CRASHED = "crashed"
+
+
+class Exit(IntEnum):
+    """Exit codes of `python -m worker.engine`. Any other code, or a signal, is a crash."""
+
+    OK = 0
+    BUG = 1  # an exception nobody foresaw: the same input would raise it again
+    BAD_INPUT = 10
+    CANNOT_RECONSTRUCT = 11
+    OUT_OF_MEMORY = 12
+    DISK_FULL = 13
+    CANCELLED = 14
+
+
+def queue_id(job_id: str, attempt: int) -> str:
+    """The id of one attempt on the queue; a stale attempt can never be mistaken for a newer one."""
+    return f"{job_id}-{attempt}"

@@ -1,0 +1,121 @@
+"""The engine process: `python -m worker.engine JOBDIR --attempt N --parent PID`.
+
+It knows one folder and nothing else: no database, no Redis, no server. It reads JOBDIR/job.json
+and JOBDIR/scan, says each progress event as one JSON line on stdout, writes the results to
+JOBDIR/attempt-N, and ends with one of `worker.contract.Exit`. An error is its last line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import importlib
+import json
+import os
+import resource
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Generator
+from pathlib import Path
+from types import FrameType
+from typing import Any, TextIO
+
+from splatcore.errors import OptionsError, ReconstructionError, ScanError
+from splatcore.options import Options
+from splatcore.progress import Progress
+from worker.contract import Exit
+from worker.jobfolder import JobFolder
+from worker.lifeline import die_with_parent
+
+Say = Callable[[dict[str, Any]], None]
+
+
+class Cancelled(Exception):
+    """The job was cancelled; raised between two events."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m worker.engine")
+    parser.add_argument("job", type=Path)
+    parser.add_argument("--attempt", type=int, required=True)
+    parser.add_argument("--parent", type=int, required=True)
+    parser.add_argument("--engine", default="splatcore")
+    given = parser.parse_args(arguments)
+    die_with_parent(given.parent)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    with _private_stdout() as out:
+
+        def say(line: dict[str, Any]) -> None:
+            out.write(json.dumps(line) + "\n")
+            out.flush()
+
+        try:
+            _work(JobFolder(given.job.parent.parent, given.job.name), given.attempt, given.engine, say)
+        except Cancelled:
+            return Exit.CANCELLED
+        except Exception as error:
+            traceback.print_exc()
+            code, message = _classify(error)
+            say({"error": message})
+            return code
+    return Exit.OK
+
+
+def _work(folder: JobFolder, attempt: int, engine: str, say: Say) -> None:
+    options = Options.from_dict(json.loads(folder.spec.read_bytes())["options"])
+    scan = _part(engine, "scan", "read_scan")(folder.scan)
+    events = _part(engine, "reconstruct", "reconstruct")(scan, options)
+    reconstruction = _drive(events, folder.cancel, say)
+    _part(engine, "results", "write_results")(reconstruction, folder.attempt(attempt))
+
+
+def _drive(events: Generator[Progress, None, Any], cancel: Path, say: Say) -> Any:
+    """Run the generator to its end and return its value, looking for a cancellation at each event."""
+    told_to_stop = False
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal told_to_stop
+        told_to_stop = True
+
+    signal.signal(signal.SIGTERM, stop)
+    while True:
+        if told_to_stop or cancel.exists():
+            events.close()
+            raise Cancelled
+        try:
+            event = next(events)
+        except StopIteration as end:
+            return end.value
+        say(event.to_json())
+
+
+def _part(engine: str, module: str, name: str) -> Callable[..., Any]:
+    part: Callable[..., Any] = getattr(importlib.import_module(f"{engine}.{module}"), name)
+    return part
+
+
+def _classify(error: Exception) -> tuple[Exit, str]:
+    """The exit code for an error, and the sentence about it that a user may read."""
+    text = str(error)
+    if isinstance(error, ScanError | OptionsError):
+        return Exit.BAD_INPUT, text
+    if isinstance(error, ReconstructionError):
+        return Exit.CANNOT_RECONSTRUCT, text
+    # torch has its own class on the GPU and a plain RuntimeError on the CPU; neither is imported here
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "allocate memory" in text:
+        return Exit.OUT_OF_MEMORY, "There is not enough memory for this scan. Try quality preview, or a smaller volume."
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return Exit.DISK_FULL, "The disk filled up while the results were written. Make room and submit the job again."
+    return Exit.BUG, f"The engine failed unexpectedly ({type(error).__name__}). The log holds the details."
+
+
+def _private_stdout() -> TextIO:
+    """Keep stdout for events; whatever else prints there goes to stderr, which is the log."""
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    return os.fdopen(kept, "w", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

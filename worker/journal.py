@@ -1,0 +1,58 @@
+"""The progress events of a job, one JSON object per line, numbered from 1 across all attempts.
+
+One writer (whoever holds the job's lock), any number of readers; no reader ever sees half a
+line, because a line counts only once its newline is there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+
+class EventWriter:
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("ab")
+        whole, self.last = _whole_lines(path)
+        os.truncate(self._file.fileno(), whole)  # a crash may have left half a line
+
+    def append(self, event: dict[str, Any]) -> None:
+        self.last += 1
+        line = json.dumps({"number": self.last, "at": time.time(), **event}, allow_nan=False)
+        self._file.write(line.encode() + b"\n")
+        self._file.flush()
+
+    def __enter__(self) -> EventWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._file.close()
+
+
+def read_events(path: Path, after: int, limit: int) -> list[dict[str, Any]]:
+    """Up to `limit` events numbered above `after`, oldest first."""
+    events: list[dict[str, Any]] = []
+    try:
+        with path.open("rb") as file:
+            for number, line in enumerate(file, start=1):
+                if not line.endswith(b"\n") or len(events) >= limit:
+                    break
+                if number > after:
+                    events.append(json.loads(line))
+    except FileNotFoundError:
+        pass
+    return events
+
+
+def _whole_lines(path: Path) -> tuple[int, int]:
+    """Length in bytes and number of the complete lines."""
+    size = count = 0
+    with path.open("rb") as file:
+        for line in file:
+            if line.endswith(b"\n"):
+                size, count = size + len(line), count + 1
+    return size, count

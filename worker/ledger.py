@@ -1,0 +1,186 @@
+"""The jobs table: the truth about every job. Redis may be wiped; this may not.
+
+Every change of state is a compare-and-set: UPDATE ... WHERE state and attempt are what the
+caller believes. Whoever loses a race changes nothing and learns so. `attempt` is the fence: it
+grows whenever a job is taken from a worker, so a worker that comes back too late finds its row gone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import sqlalchemy as sa
+
+from worker.contract import ACTIVE, FINISHED, MAX_CRASHES, TRANSITIONS, ErrorKind, State
+from worker.database import Database, metadata
+
+jobs = sa.Table(
+    "jobs",
+    metadata,
+    sa.Column("id", sa.String(36), primary_key=True),
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("scan_id", sa.String(36), nullable=False, index=True),
+    sa.Column("scan_name", sa.Text, nullable=False),
+    sa.Column("options", sa.JSON, nullable=False),
+    sa.Column("state", sa.String(16), nullable=False, index=True),
+    sa.Column("stage", sa.String(32), nullable=False, default=""),
+    sa.Column("message", sa.Text, nullable=False, default=""),
+    sa.Column("progress", sa.Float, nullable=False, default=0.0),
+    sa.Column("eta_s", sa.Float),
+    sa.Column("attempt", sa.Integer, nullable=False, default=1),
+    sa.Column("crashes", sa.Integer, nullable=False, default=0),
+    sa.Column("host", sa.Text),
+    sa.Column("heartbeat", sa.Float),
+    sa.Column("error_kind", sa.String(32)),
+    sa.Column("error_message", sa.Text),
+    sa.Column("created_at", sa.Float, nullable=False, index=True),  # seconds since 1970, UTC
+    sa.Column("started_at", sa.Float),
+    sa.Column("finished_at", sa.Float),
+)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One row of the jobs table."""
+
+    id: str
+    name: str
+    scan_id: str
+    scan_name: str
+    options: dict[str, Any]
+    state: State
+    stage: str
+    message: str
+    progress: float
+    eta_s: float | None
+    attempt: int
+    crashes: int
+    host: str | None
+    heartbeat: float | None
+    error_kind: str | None
+    error_message: str | None
+    created_at: float
+    started_at: float | None
+    finished_at: float | None
+
+
+class Ledger:
+    """Reads and changes jobs. Methods that change one return whether the change took place."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def add(self, write: sa.Connection, job_id: str, name: str, scan: tuple[str, str], options: dict[str, Any]) -> None:
+        """Insert a queued job within the caller's transaction. `scan` is (id, name)."""
+        row = {"id": job_id, "name": name, "scan_id": scan[0], "scan_name": scan[1], "options": options}
+        write.execute(jobs.insert().values(**row, state=State.QUEUED, message="Waiting", created_at=time.time()))
+
+    def get(self, job_id: str) -> Job | None:
+        with self._database.reading() as read:
+            row = read.execute(sa.select(jobs).where(jobs.c.id == job_id)).one_or_none()
+        return None if row is None else _job(row)
+
+    def page(self, state: State | None, limit: int, before: Job | None) -> list[Job]:
+        """Jobs, newest first, older than `before`."""
+        query = sa.select(jobs).order_by(jobs.c.created_at.desc(), jobs.c.id.desc()).limit(limit)
+        if state is not None:
+            query = query.where(jobs.c.state == state)
+        if before is not None:
+            query = query.where(sa.tuple_(jobs.c.created_at, jobs.c.id) < (before.created_at, before.id))
+        with self._database.reading() as read:
+            return [_job(row) for row in read.execute(query)]
+
+    def in_states(self, states: Iterable[State]) -> list[Job]:
+        """Jobs in any of `states`, oldest first."""
+        query = sa.select(jobs).where(jobs.c.state.in_(list(states))).order_by(jobs.c.created_at, jobs.c.id)
+        with self._database.reading() as read:
+            return [_job(row) for row in read.execute(query)]
+
+    def position(self, job: Job) -> int:
+        """1 for the queued job that is next."""
+        ahead = sa.tuple_(jobs.c.created_at, jobs.c.id) < (job.created_at, job.id)
+        query = sa.select(sa.func.count()).select_from(jobs).where(jobs.c.state == State.QUEUED, ahead)
+        with self._database.reading() as read:
+            return int(read.execute(query).scalar_one()) + 1
+
+    def needs_scan(self, read: sa.Connection, scan_id: str) -> bool:
+        query = sa.select(jobs.c.id).where(jobs.c.scan_id == scan_id, jobs.c.state.in_(list(ACTIVE))).limit(1)
+        return read.execute(query).first() is not None
+
+    def claim(self, job_id: str, attempt: int, host: str) -> Job | None:
+        """Take a queued attempt for this worker; None when it is not to be had (any more)."""
+        now = time.time()
+        fresh = {"stage": "start", "message": "Starting", "progress": 0.0, "eta_s": None, "heartbeat": now}
+        if not self._move(job_id, attempt, State.QUEUED, State.RUNNING, host=host, started_at=now, **fresh):
+            return None
+        return self.get(job_id)
+
+    def beat(self, job_id: str, attempt: int, values: dict[str, Any]) -> State | None:
+        """Mark the row alive and note progress. Returns its state, None if the job is no longer ours."""
+        mine = sa.and_(jobs.c.id == job_id, jobs.c.attempt == attempt)
+        alive = jobs.c.state.in_([State.RUNNING, State.CANCELLING])
+        update = jobs.update().where(mine, alive).values(heartbeat=time.time(), **values).returning(jobs.c.state)
+        with self._database.writing() as write:
+            row = write.execute(update).one_or_none()
+        return None if row is None else State(row.state)
+
+    def succeed(self, job_id: str, attempt: int) -> bool:
+        end = {"stage": "done", "message": "Done", "progress": 1.0}
+        return self._move(job_id, attempt, State.RUNNING, State.SUCCEEDED, **end)
+
+    def fail(self, job_id: str, attempt: int, kind: ErrorKind, message: str, was: State = State.RUNNING) -> bool:
+        error = {"error_kind": kind, "error_message": message, "message": "Failed"}
+        return self._move(job_id, attempt, was, State.FAILED, **error)
+
+    def end_cancel(self, job_id: str, attempt: int) -> bool:
+        return self._move(job_id, attempt, State.CANCELLING, State.CANCELLED, message="Cancelled")
+
+    def hand_back(self, job_id: str, attempt: int) -> bool:
+        """Queue the job again because its worker was told to stop: nobody's fault, not counted."""
+        return self._requeue(job_id, attempt, "Its worker was stopped; waiting for another")
+
+    def crashed(self, job: Job, what: str) -> bool:
+        """Queue the job again after its attempt died, or fail it if that happened too often."""
+        if job.crashes + 1 < MAX_CRASHES:
+            return self._requeue(job.id, job.attempt, f"{what}; waiting to start again", crashes=job.crashes + 1)
+        message = f"{what}, {job.crashes + 1} times. The machine may be short of memory; the log may say more."
+        return self.fail(job.id, job.attempt, ErrorKind.CRASHED, message)
+
+    def ask_cancel(self, job_id: str) -> Job | None:
+        """Cancel a queued job at once, ask for it when running, leave a finished one alone."""
+        for _ in range(5):  # the state may change between look and leap
+            job = self.get(job_id)
+            if job is None or job.state not in (State.QUEUED, State.RUNNING):
+                break
+            queued = job.state is State.QUEUED
+            goal, text = (State.CANCELLED, "Cancelled") if queued else (State.CANCELLING, "Cancelling")
+            if self._move(job_id, job.attempt, job.state, goal, message=text, eta_s=None):
+                break
+        return self.get(job_id)
+
+    def forget(self, job_id: str) -> bool:
+        """Delete the row of a finished job."""
+        done = sa.and_(jobs.c.id == job_id, jobs.c.state.in_(list(FINISHED)))
+        with self._database.writing() as write:
+            return write.execute(jobs.delete().where(done)).rowcount == 1
+
+    def _requeue(self, job_id: str, attempt: int, message: str, **values: Any) -> bool:
+        fresh = {"stage": "", "progress": 0.0, "eta_s": None, "host": None, "heartbeat": None}
+        again = {"attempt": attempt + 1, "message": message, **fresh, **values}
+        return self._move(job_id, attempt, State.RUNNING, State.QUEUED, **again)
+
+    def _move(self, job_id: str, attempt: int, old: State, new: State, **values: Any) -> bool:
+        assert new in TRANSITIONS[old], (old, new)
+        if new in FINISHED:
+            values = {"finished_at": time.time(), "eta_s": None, **values}
+        expected = sa.and_(jobs.c.id == job_id, jobs.c.attempt == attempt, jobs.c.state == old)
+        with self._database.writing() as write:
+            return write.execute(jobs.update().where(expected).values(state=new, **values)).rowcount == 1
+
+
+def _job(row: sa.Row[Any]) -> Job:
+    values = dict(row._mapping)
+    return Job(**{**values, "state": State(values["state"])})

@@ -1,0 +1,33 @@
+"""What a worker must know, from `SPLATCT_*` environment variables. Read on use, never at import."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class WorkerSettings(BaseSettings):
+    """Where jobs live and how long they may take. The server's settings extend it."""
+
+    model_config = SettingsConfigDict(env_prefix="SPLATCT_", extra="ignore")
+
+    data: Path = Path("splatct-data")
+    database_url: str = Field(default="", repr=False)  # empty: SQLite in the data folder
+    redis_url: str = Field(default="redis://127.0.0.1:6379/0", repr=False)
+    job_seconds: float = 24 * 3600.0  # longest a job may run
+    cancel_grace_s: float = 10.0  # time for the engine to stop by itself before it is terminated
+    engine: str = "splatcore"  # for tests: the package the engine process takes its functions from
+
+    @property
+    def database(self) -> str:
+        return self.database_url or f"sqlite:///{self.data.absolute() / 'splatct.db'}"
+
+    def to_environment(self) -> dict[str, str]:
+        """These settings as environment variables, for child processes."""
+        return {
+            f"SPLATCT_{name.upper()}": str(value.absolute() if isinstance(value, Path) else value)
+            for name, value in self
+            if value is not None and not isinstance(value, list)
+        }

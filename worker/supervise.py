@@ -1,0 +1,244 @@
+"""The task RQ runs: carries one attempt of one job from claim to publication.
+
+Runs in the worker's forked child and never imports torch or numpy. The steps at the end are
+ordered so that a kill between any two of them loses nothing: the results are made durable,
+appear under their final name by one rename, and only then is the job recorded as done. A row left
+`running` beside published results is finished by the server's reconcile loop.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import time
+from types import FrameType
+from typing import Any
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from worker.contract import HEARTBEAT_S, ErrorKind, Exit, State
+from worker.database import Database
+from worker.jobfolder import JobFolder
+from worker.journal import EventWriter
+from worker.ledger import Job, Ledger
+from worker.lifeline import die_with_parent, host_id
+from worker.process import EngineProcess
+from worker.settings import WorkerSettings
+
+log = logging.getLogger("splatct.worker")
+
+LOCK_WAIT_S = 3.0  # an engine that was just killed needs a moment to let go
+TICK_S = 0.5
+DATABASE_PATIENCE_S = 600.0
+
+_ERRORS = {
+    Exit.BUG: ErrorKind.CRASHED,
+    Exit.BAD_INPUT: ErrorKind.BAD_INPUT,
+    Exit.CANNOT_RECONSTRUCT: ErrorKind.CANNOT_RECONSTRUCT,
+    Exit.OUT_OF_MEMORY: ErrorKind.OUT_OF_MEMORY,
+    Exit.DISK_FULL: ErrorKind.DISK_FULL,
+}
+
+
+class Lost(Exception):
+    """The job is no longer ours: it was given to another attempt, or deleted."""
+
+
+class StopFlag:
+    """Set by SIGTERM: the worker is to go, and its job back to the queue."""
+
+    def __init__(self) -> None:
+        self.set = False
+
+    def __call__(self, _signal: int, _frame: FrameType | None) -> None:
+        self.set = True
+
+
+def run_job(job_id: str, attempt: int) -> None:
+    """Entry point for RQ. Says nothing to RQ: the ledger is where outcomes go."""
+    assert "torch" not in sys.modules, "the worker process must stay light; only the engine imports torch"
+    worker = os.environ.get("SPLATCT_WORKER_PID")
+    if worker is not None:
+        die_with_parent(int(worker))
+    settings = WorkerSettings()
+    database = Database(settings.database)
+    try:
+        supervise(settings, Ledger(database), job_id, attempt)
+    finally:
+        database.close()
+
+
+def supervise(settings: WorkerSettings, ledger: Ledger, job_id: str, attempt: int) -> None:
+    """Claim the attempt and see it through; return quietly when it is not to be had."""
+    stop = StopFlag()
+    signal.signal(signal.SIGTERM, stop)
+    folder = JobFolder(settings.data.absolute(), job_id)
+    with folder.lock(LOCK_WAIT_S) as lock:
+        if lock is None or stop.set:
+            return  # deleted, or another process still works on it: the reconcile loop will ask again
+        job = ledger.claim(job_id, attempt, host_id())
+        if job is None:
+            return
+        try:
+            _Attempt(settings, ledger, folder, job, lock, stop).run()
+        except Lost:
+            log.warning("job %s: attempt %d is no longer ours", job_id, attempt)
+
+
+class _Attempt:
+    def __init__(
+        self, settings: WorkerSettings, ledger: Ledger, folder: JobFolder, job: Job, lock: int, stop: StopFlag
+    ) -> None:
+        self._settings = settings
+        self._ledger = ledger
+        self._folder = folder
+        self._job = job
+        self._lock = lock
+        self._started = time.monotonic()
+        self._beaten = 0.0
+        self._news: dict[str, Any] = {}  # progress the row does not show yet
+        self._error = ""
+        self._cancelling_since: float | None = None
+        self._stop = stop
+        self._timed_out = False
+
+    def run(self) -> None:
+        if self._folder.published():  # an earlier attempt got this far and died before saying so
+            self._record_success()
+            return
+        job = self._job
+        spec = {"id": job.id, "attempt": job.attempt, "options": job.options}
+        self._folder.prepare(spec, job.attempt)
+        with EventWriter(self._folder.events) as events:
+            if job.attempt > 1:
+                events.append({"stage": "start", "fraction": 0.0, "message": f"Starting again: attempt {job.attempt}"})
+            engine = EngineProcess(self._folder, job.attempt, self._settings.engine, self._lock)
+            try:
+                self._watch(engine, events)
+            finally:
+                engine.close()
+        self._conclude(engine.code)
+
+    def _watch(self, engine: EngineProcess, events: EventWriter) -> None:
+        """Until the engine has ended: pass its progress on, keep the row alive, heed requests."""
+        while not engine.ended():
+            for event in engine.read(TICK_S / 2):
+                self._take(event, events)
+            if self._stop.set:
+                engine.signal(signal.SIGKILL)
+                continue
+            now = time.monotonic()
+            if now - self._beaten >= (TICK_S if self._news else HEARTBEAT_S / 2):
+                self._beat(now)
+            self._heed_limits(engine, now)
+        for event in engine.read(0):
+            self._take(event, events)
+
+    def _take(self, event: dict[str, Any], events: EventWriter) -> None:
+        if "error" in event:
+            self._error = str(event["error"])
+            return
+        event = {**event, "attempt": self._job.attempt}
+        events.append(event)
+        fraction = min(1.0, max(0.0, float(event.get("fraction", 0.0))))
+        spent = time.monotonic() - self._started
+        self._news = {
+            "stage": str(event.get("stage", ""))[:32],
+            "message": str(event.get("message", "")),
+            "progress": fraction,
+            "eta_s": round(spent * (1 - fraction) / fraction, 1) if fraction > 0.01 else None,
+        }
+
+    def _beat(self, now: float) -> None:
+        self._beaten = now
+        try:
+            state = self._ledger.beat(self._job.id, self._job.attempt, self._news)
+        except SQLAlchemyError:
+            log.warning("job %s: the database did not take a heartbeat", self._job.id, exc_info=True)
+            return
+        if state is None:
+            raise Lost
+        self._news = {}
+        if state is State.CANCELLING and self._cancelling_since is None:
+            self._cancelling_since = now
+            self._folder.cancel.touch()
+
+    def _heed_limits(self, engine: EngineProcess, now: float) -> None:
+        """Escalate a cancellation, or a job that takes too long: ask, terminate, kill."""
+        if not self._timed_out and now - self._started > self._settings.job_seconds:
+            self._timed_out = True
+            self._folder.cancel.touch()
+            self._cancelling_since = self._cancelling_since or now
+        if self._cancelling_since is not None:
+            waited = now - self._cancelling_since
+            if waited > 2 * self._settings.cancel_grace_s:
+                engine.signal(signal.SIGKILL)
+            elif waited > self._settings.cancel_grace_s:
+                engine.signal(signal.SIGTERM)
+
+    def _conclude(self, code: int) -> None:
+        """Turn the engine's end into the job's."""
+        job, ledger = self._job, self._ledger
+        if code == Exit.OK and not self._timed_out:
+            self._publish()
+            return
+        state = self._insist_on_state()
+        if state is State.CANCELLING:
+            self._record_cancel()
+        elif self._timed_out:
+            limit = f"{self._settings.job_seconds / 3600:.3g} h"
+            ledger.fail(job.id, job.attempt, ErrorKind.TIMEOUT, f"The job was stopped at its time limit of {limit}.")
+        elif self._stop.set or code == Exit.CANCELLED:  # the latter: somebody terminated the engine politely
+            ledger.hand_back(job.id, job.attempt)
+            return
+        elif code in _ERRORS:
+            message = self._error or "The engine failed. The log holds the details."
+            ledger.fail(job.id, job.attempt, _ERRORS[Exit(code)], message)
+        else:
+            ledger.crashed(job, _obituary(code))
+            return
+        self._folder.tidy()
+
+    def _publish(self) -> None:
+        """Fence, make durable, rename, record: in this order."""
+        if self._insist_on_state() is State.CANCELLING:
+            self._record_cancel()
+            return
+        self._folder.publish(self._job.attempt)
+        self._record_success()
+
+    def _record_success(self) -> None:
+        if not self._ledger.succeed(self._job.id, self._job.attempt):
+            if self._insist_on_state() is not State.CANCELLING:
+                raise Lost
+            self._record_cancel()  # the request came after the rename
+            return
+        self._folder.tidy()
+
+    def _record_cancel(self) -> None:
+        self._folder.discard_results()
+        self._ledger.end_cancel(self._job.id, self._job.attempt)
+        self._folder.tidy()
+
+    def _insist_on_state(self) -> State:
+        """The row's state, waiting out a database that is away. Raises Lost if it is not ours."""
+        deadline = time.monotonic() + DATABASE_PATIENCE_S
+        while True:
+            try:
+                state = self._ledger.beat(self._job.id, self._job.attempt, self._news)
+            except SQLAlchemyError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(1.0)
+                continue
+            if state is None:
+                raise Lost
+            return state
+
+
+def _obituary(code: int) -> str:
+    if code < 0:
+        return f"The engine was killed ({signal.Signals(-code).name})"
+    return f"The engine ended unexpectedly (exit code {code})"
