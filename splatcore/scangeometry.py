@@ -37,7 +37,9 @@ def read_geometry(given: Any, doc: Document) -> Frames | None:
     frames: Frames | None = None
     if by_frames:
         if detector is not None and beam in get_args(geometry.Beam):
-            frames = _frames(given["frames"], "cone" if beam == "cone" else "parallel", detector, doc)
+            frames = read_frames(
+                given["frames"], f"{at}/frames", "cone" if beam == "cone" else "parallel", detector[:2], doc
+            )
     else:
         dso, dsd = distance["dso_mm"], distance["dsd_mm"]
         if beam == "parallel" and not ("dso_mm" in given and "dsd_mm" in given):
@@ -82,8 +84,8 @@ def _detector(given: Any, by_frames: bool, doc: Document) -> _Detector | None:
     return rows, cols, (pixel[0], pixel[1]), (offset[0], offset[1])
 
 
-def _frames(given: Any, beam: geometry.Beam, detector: _Detector, doc: Document) -> Frames | None:
-    at = "/geometry/frames"
+def read_frames(given: Any, at: str, beam: geometry.Beam, detector: tuple[int, int], doc: Document) -> Frames | None:
+    """Frames given view by view, as `Frames.to_json` writes them. `at` is their JSON pointer, detector (rows, cols)."""
     items = doc.array(given, at)
     if items is None:
         return None
