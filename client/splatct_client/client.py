@@ -157,6 +157,10 @@ class Client:
         manifest = self._json("GET", f"/v1/jobs/{_id(job_id)}/results")
         return [ResultFile.from_json(file) for file in _items(manifest, "files")]
 
+    def manifest(self, job_id: str) -> bytes:
+        """manifest.json itself, which cannot list its own sha256."""
+        return self._request("GET", f"/v1/jobs/{_id(job_id)}/results/manifest.json").content
+
     def download(self, job_id: str, file: ResultFile, folder: Path, on_bytes: OnBytes | None = None) -> Path:
         """Fetch one result file into `folder`: resumed, checked, and there under its name only when whole."""
         return fetch_file(self, f"/v1/jobs/{_id(job_id)}/results/{_name(file.name)}", file, folder, on_bytes)
@@ -239,7 +243,7 @@ def _parsed(response: httpx.Response) -> Any:
 
 
 def _items(data: Any, key: str) -> list[Any]:
-    items = data.get(key) if isinstance(data, dict) else data
+    items = data.get(key) if isinstance(data, dict) else None
     if not isinstance(items, list):
         raise UnexpectedAnswer(f"the server's answer has no list {key!r}")
     return items

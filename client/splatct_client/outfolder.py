@@ -26,14 +26,13 @@ def check_out_folder(folder: Path, *, overwrite: bool, job_id: str | None = None
 
 
 def fetch_results(client: Client, job_id: str, folder: Path, only: list[str] | None = None) -> list[Path]:
-    """Download every result file (or those named in `only`), manifest.json last."""
-    files = client.results(job_id)
+    """Download every result file (or those named in `only`), manifest.json last: where it is, all is."""
+    files = [file for file in client.results(job_id) if file.name != "manifest.json"]
     if only:
         missing = sorted(set(only) - {file.name for file in files})
         if missing:
             raise InputError(f"the job has no result file {missing[0]!r}; it has: {', '.join(f.name for f in files)}")
         files = [file for file in files if file.name in only]
-    files.sort(key=lambda file: file.name == "manifest.json")
     for file in files:
         place(folder, file.name)  # refuse a bad name before the first byte
     try:
@@ -42,6 +41,10 @@ def fetch_results(client: Client, job_id: str, folder: Path, only: list[str] | N
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {error.strerror}") from error
     paths = _fetch_all(client, job_id, files, folder)
+    if not only:
+        part = folder / "manifest.json.part"
+        part.write_bytes(client.manifest(job_id))
+        paths.append(part.replace(folder / "manifest.json"))
     (folder / MARKER).unlink(missing_ok=True)
     return paths
 

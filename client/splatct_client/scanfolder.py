@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import unicodedata
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from splatct_client.errors import InputError, Problem
 from splatct_client.models import FileSpec
+
+CALIBRATION = ("flat", "dark", "bad_pixels")
 
 
 @dataclass(frozen=True)
@@ -18,7 +21,7 @@ class ScanFolder:
 
     name: str
     scan_json: bytes  # without `simulation`: the truth is for `splatct evaluate`, not for the server
-    files: dict[str, Path]  # every other file, by the name that scan.json gives it
+    files: dict[str, Path]  # every other file, by the name in the scan.json above
 
     @property
     def specs(self) -> list[FileSpec]:
@@ -48,23 +51,52 @@ def read_scan_folder(folder: Path) -> ScanFolder:
     if not isinstance(scan, dict):
         raise InputError(f"{path}: expected a JSON object, got {type(scan).__name__}")
 
-    files: dict[str, Path] = {}
     problems: list[Problem] = []
-    for pointer, name in _named(scan, problems):
+    named = list(_named(scan, problems))
+    for pointer, name in named:
         problem = _wrong_with(folder, name)
         if problem:
             problems.append(Problem(f"scan.json{pointer}", *problem))
-        else:
-            files[name] = folder / name
+    sent_as = plain_names(name for _, name in named)
     if problems:
         raise InputError(f"{folder} cannot be submitted:", problems)
     scan.pop("simulation", None)
+    for _, owner, key in _slots(scan):
+        given = owner[key]
+        owner[key] = [sent_as[name] for name in given] if isinstance(given, list) else sent_as[given]
     title = scan.get("name")
     return ScanFolder(
         name=title if isinstance(title, str) and title else folder.resolve().name,
         scan_json=json.dumps(scan, ensure_ascii=False, indent=1).encode(),
-        files=files,
+        files={sent: folder / name for name, sent in sent_as.items()},
     )
+
+
+def plain_names(names: Iterable[str]) -> dict[str, str]:
+    """The name under which each file is sent. The server takes no folders, only Unicode form C, and no
+    two names that differ in nothing but their capitals."""
+    sent: dict[str, str] = {}
+    taken = {"scan.json"}
+    for name in names:
+        if name in sent:
+            continue
+        plain = wanted = unicodedata.normalize("NFC", "_".join(PurePosixPath(name).parts))
+        count = 1
+        while plain.casefold() in taken:
+            count += 1
+            plain = f"{PurePosixPath(wanted).stem}-{count}{PurePosixPath(wanted).suffix}"
+        taken.add(plain.casefold())
+        sent[name] = plain
+    return sent
+
+
+def _slots(scan: dict[str, Any]) -> list[tuple[str, dict[str, Any], str]]:
+    """The places in scan.json that name files: pointer, object and key. `flat`, `dark` and `bad_pixels`
+    may stand in `projections` or beside it."""
+    projections = scan["projections"]
+    places = [("/projections", projections, key) for key in ("files", *CALIBRATION)]
+    places += [("", scan, key) for key in CALIBRATION]
+    return [(f"{pointer}/{key}", owner, key) for pointer, owner, key in places if owner.get(key) is not None]
 
 
 def _named(scan: dict[str, Any], problems: list[Problem]) -> Iterator[tuple[str, str]]:
@@ -75,19 +107,12 @@ def _named(scan: dict[str, Any], problems: list[Problem]) -> Iterator[tuple[str,
         return
     if not projections.get("files"):
         problems.append(Problem("scan.json/projections/files", "names no file"))
-    for key in ("files", "flat", "dark", "bad_pixels"):
-        # The calibration files may stand beside `projections` too.
-        for pointer, owner in (("/projections", projections), ("", scan)):
-            if key == "files" and owner is scan:
-                continue
-            given = owner.get(key)
-            if given is None:
-                continue
-            for name in given if isinstance(given, list) else [given]:
-                if isinstance(name, str) and name:
-                    yield f"{pointer}/{key}", name
-                else:
-                    problems.append(Problem(f"scan.json{pointer}/{key}", f"got {name!r}, expected a file name"))
+    for pointer, owner, key in _slots(scan):
+        for name in owner[key] if isinstance(owner[key], list) else [owner[key]]:
+            if isinstance(name, str) and name:
+                yield pointer, name
+            else:
+                problems.append(Problem(f"scan.json{pointer}", f"got {name!r}, expected a file name"))
 
 
 def _wrong_with(folder: Path, name: str) -> tuple[str, str] | None:

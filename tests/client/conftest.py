@@ -77,10 +77,10 @@ class FakeApi:
 
     def _answer(self, method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
         if (method, path) == ("GET", "/options"):
-            return ok([
+            return ok({"options": [
                 {"name": "calibrate", "choices": ["full", "static", "none"], "low": None, "high": None},
                 {"name": "splats", "choices": None, "low": 100, "high": 5000000},
-            ])  # fmt: skip
+            ]})  # fmt: skip
         if (method, path) == ("POST", "/uploads"):
             self.announced = json.loads(body)
             return ok({"id": "up-1", "name": self.announced["name"], "state": "open", "files": []}, 201)
@@ -107,6 +107,8 @@ class FakeApi:
                 {"name": n, "size": len(b), "sha256": hashlib.sha256(b).hexdigest()} for n, b in self.results.items()
             ]})  # fmt: skip
         name = path.removeprefix(f"/jobs/{JOB_ID}/results/")
+        if name == "manifest.json":
+            return ok({"files": []})
         if method == "GET" and name in self.results:
             return self._bytes(self.results[name], headers.get("range"))
         return problem(404, "Not found", f"there is no {path}")

@@ -23,6 +23,27 @@ def test_everything_named_is_sent_and_the_truth_stays_at_home(scan):
     assert found.size == sum(len(s) if isinstance(s, bytes) else s.stat().st_size for s in found.sources.values())
 
 
+def test_subfolders_are_flattened_and_scan_json_says_so(scan):
+    for folder in ("cam/a", "cam/b"):
+        (scan / folder).mkdir(parents=True)
+        (scan / folder / "1.tif").write_bytes(folder.encode())
+    (scan / "cam_a_1.tif").write_bytes(b"taken")
+    names = ["cam/a/1.tif", "cam/b/1.tif", "cam_a_1.tif", "cam/a/1.tif"]
+    rewrite(scan, projections={"files": names}, bad_pixels=None)
+    found = read_scan_folder(scan)
+    sent = json.loads(found.scan_json)["projections"]["files"]
+    assert len(set(sent)) == 3 and sent[0] == sent[3] and all("/" not in name for name in sent)
+    assert [found.files[name].read_bytes() for name in sent[:3]] == [b"cam/a", b"cam/b", b"taken"]
+
+
+def test_names_are_sent_in_one_unicode_form(scan):
+    (scan / "Ra\u0308nder.tif").write_bytes(b"x")  # as macOS writes it
+    rewrite(scan, projections={"files": ["Ra\u0308nder.tif"]})
+    found = read_scan_folder(scan)
+    assert "R\u00e4nder.tif" in found.files
+    assert json.loads(found.scan_json)["projections"]["files"] == ["R\u00e4nder.tif"]
+
+
 def test_the_folder_names_a_scan_without_a_name(scan):
     rewrite(scan, name="")
     assert read_scan_folder(scan).name == "scan"

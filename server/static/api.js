@@ -1,0 +1,55 @@
+// Calls to the API of this very server, and the loop that keeps a page fresh.
+
+import { byId, setText } from "./dom.js";
+
+export async function call(path, init = {}) {
+  const response = await fetch(path, { headers: { Accept: "application/json" }, ...init });
+  if (!response.ok) throw await problem(response);
+  return response.json();
+}
+
+async function problem(response) {
+  let body = {};
+  try {
+    body = await response.json();
+  } catch {
+    // not problem+json: the status line must do
+  }
+  const listed = (body.errors ?? []).map((error) => `${error.where}: ${error.what}`);
+  const text = [body.detail || body.title || `The server answered ${response.status}`, ...listed].join("; ");
+  return Object.assign(new Error(text), { status: response.status });
+}
+
+// Runs `refresh` again and again; it returns the pause in ms, or null to stop. A hidden page rests.
+export function keepFresh(refresh, onRefused) {
+  const connection = byId("connection");
+  let failures = 0;
+  const turn = async () => {
+    if (document.hidden) {
+      document.addEventListener("visibilitychange", turn, { once: true });
+      return;
+    }
+    let pause = 2000;
+    try {
+      pause = await refresh();
+      failures = 0;
+      setText(connection, "");
+    } catch (error) {
+      if (error.status && error.status < 500) {
+        onRefused(error);
+        return;
+      }
+      failures += 1;
+      setText(connection, "The server does not answer; trying again");
+      pause = Math.min(2000 * failures, 15000);
+    }
+    if (pause !== null) setTimeout(turn, pause);
+  };
+  turn();
+}
+
+export function notice(text) {
+  const box = byId("notice");
+  setText(box, text);
+  box.hidden = text === "";
+}

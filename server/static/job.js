@@ -1,0 +1,117 @@
+// One job: progress while it runs, results once it has them.
+
+import { call, keepFresh, notice } from "./api.js";
+import { byId, bytes, duration, el, finished, moment, place, setText, stateBadge, took, update } from "./dom.js";
+import { Live } from "./live.js";
+import { showPoses } from "./poses.js";
+import { showReport } from "./report.js";
+import { showSlices } from "./slices.js";
+
+const id = byId("job").dataset.id;
+const url = `/v1/jobs/${encodeURIComponent(id)}`;
+const STAGES = [["read", "Read"], ["start", "First volume"], ["level", "Fit splats and poses"], ["diagnose", "Diagnose"], ["write", "Write"]];
+
+let live = null;
+let resultsShown = false;
+
+function show(job) {
+  const name = job.name || job.scan_name || "unnamed";
+  setText(byId("name"), name);
+  const percent = finished(job) || job.state === "queued" ? job.state : `${Math.round(job.progress * 100)} %`;
+  document.title = `${percent} · ${name} · SplatCT`;
+  update(byId("state"), [stateBadge(job)]);
+  byId("cancel").hidden = !["queued", "running", "cancelling"].includes(job.state);
+  byId("cancel").disabled = job.state === "cancelling";
+
+  byId("progress-panel").hidden = finished(job);
+  byId("bar").value = job.progress;
+  setText(byId("message"), [job.message, job.state === "queued" ? place(job) : ""].filter(Boolean).join(", "));
+  setText(byId("eta"), job.eta_s ? `about ${duration(job.eta_s)} left` : "");
+  showStages(job.stage);
+
+  byId("failure").hidden = job.state !== "failed";
+  setText(byId("failure-text"), job.error?.message ?? "The server gave no reason.");
+  showDetails(job);
+}
+
+function showStages(stage) {
+  const now = STAGES.findIndex(([name]) => name === (stage === "poses" ? "level" : stage)); // the two take turns
+  const nodes = STAGES.map(([, text], index) =>
+    el("li", { class: index < now ? "past" : index === now ? "now" : "ahead", "aria-current": index === now ? "step" : null }, text),
+  );
+  update(byId("stages"), nodes);
+}
+
+function showDetails(job) {
+  const options = Object.entries(job.options ?? {}).map(([name, value]) => `${name} = ${value === null ? "automatic" : value}`);
+  const rows = [
+    ["Scan", job.scan_name],
+    ["Submitted", moment(job.created_at)],
+    ["Started", moment(job.started_at)],
+    ["Finished", moment(job.finished_at)],
+    ["Took", took(job)],
+    ["Attempt", String(job.attempt)],
+    ["Options", options.join(", ") || "all at their defaults"],
+    ["Job", el("code", {}, job.id)],
+    ["Log", el("a", { href: `${url}/log` }, "engine's log")],
+  ];
+  update(byId("facts"), rows.flatMap(([name, value]) => [el("dt", {}, name), el("dd", {}, value ?? "–")]));
+  byId("details").hidden = false;
+}
+
+async function showResults() {
+  const files = (await call(`${url}/results`)).files;
+  const path = (file) => `${url}/results/${file.name.split("/").map(encodeURIComponent).join("/")}`;
+  byId("file-rows").replaceChildren(
+    ...files.map((file) =>
+      el(
+        "tr",
+        {},
+        el("th", { scope: "row" }, el("a", { href: path(file), download: file.name.endsWith(".html") ? null : true }, file.name)),
+        el("td", {}, bytes(file.size)),
+        el("td", {}, el("code", { title: file.sha256 }, `${file.sha256.slice(0, 12)}…`)),
+      ),
+    ),
+  );
+  byId("files").hidden = false;
+  const named = new Map(files.map((file) => [file.name, file]));
+  const parts = [];
+  if (named.has("report.json")) parts.push(showReport(id));
+  if (named.has("volume.tif")) parts.push(showSlices(id));
+  if (named.has("poses.json")) parts.push(showPoses(path(named.get("poses.json"))));
+  const failed = (await Promise.allSettled(parts)).filter((part) => part.status === "rejected");
+  if (failed.length) notice(`Some results cannot be shown: ${failed.map((part) => part.reason.message).join("; ")}`);
+}
+
+async function refresh() {
+  const job = await call(url);
+  show(job);
+  if (job.state !== "queued" || job.attempt > 1) {
+    byId("live").hidden = false;
+    live ??= new Live(id);
+    await live.refresh();
+    byId("live").hidden = finished(job) && live.last === 0;
+  }
+  if (job.state === "succeeded" && !resultsShown) {
+    await showResults();
+    resultsShown = true;
+  }
+  return finished(job) ? null : 2000;
+}
+
+async function cancel() {
+  if (!confirm("Cancel this job? What it has computed so far is lost.")) return;
+  try {
+    show(await call(`${url}/cancel`, { method: "POST" }));
+  } catch (error) {
+    notice(error.message);
+  }
+}
+
+setText(byId("fetch-command"), `splatct fetch ${id} --server ${location.origin} -o RESULTS`);
+byId("cancel").addEventListener("click", cancel);
+keepFresh(refresh, (error) => {
+  const missing = error.status === 404 || error.status === 422;
+  setText(byId("name"), missing ? "No such job" : "Job");
+  notice(missing ? "This server has no such job. It may have been deleted; the list of jobs shows the rest." : error.message);
+});

@@ -1,0 +1,44 @@
+// Per-view corrections with their uncertainty, and the scanner's constant errors.
+
+import { call } from "./api.js";
+import { chart } from "./chart.js";
+import { byId, el, number } from "./dom.js";
+
+export async function showPoses(url) {
+  const poses = await call(url);
+  const views = poses.views ?? [];
+  const turn = chart({ title: "Rotation", xLabel: "view", yLabel: "about x, y, z, °" });
+  const shift = chart({ title: "Translation", xLabel: "view", yLabel: "along x, y, z, mm" });
+  const residual = chart({ title: "Residual", xLabel: "view", yLabel: "RMS residual" });
+  byId("pose-charts").replaceChildren(turn.node, shift.node, residual.node);
+  byId("poses").hidden = false; // before drawing: a hidden chart has no width
+  turn.show(components(views, "rotation_deg"));
+  shift.show(components(views, "translation_mm"));
+  residual.show([{ name: "residual", points: views.map((view) => [view.index, view.residual_rms]) }]);
+  residual.node.hidden = !views.some((view) => Number.isFinite(view.residual_rms));
+  byId("static").replaceChildren(...constants(poses.static ?? {}));
+}
+
+function components(views, key) {
+  return ["x", "y", "z"].map((name, axis) => ({
+    name,
+    points: views.map((view) => [view.index, view.correction?.[key]?.[axis], view.sigma?.[key]?.[axis]]),
+  }));
+}
+
+function constants(found) {
+  const rows = Object.entries(found).map(([name, value]) => [el("dt", {}, name.replaceAll("_", " ")), el("dd", {}, told(value))]);
+  if (rows.length === 0) return [];
+  return [el("h3", {}, "Constant over the scan"), el("dl", { class: "facts" }, ...rows.flat())];
+}
+
+function told(value) {
+  if (typeof value === "number") return number(value, 4);
+  if (value === null) return "not determined";
+  if (typeof value !== "object") return String(value);
+  if (typeof value.value === "number") {
+    const sigma = Number.isFinite(value.sigma) ? ` ± ${number(value.sigma, 2)}` : "";
+    return `${number(value.value, 4)}${sigma}`;
+  }
+  return JSON.stringify(value);
+}

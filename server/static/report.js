@@ -1,0 +1,29 @@
+// The verdict and the findings behind it.
+
+import { call } from "./api.js";
+import { byId, el, number, setText } from "./dom.js";
+
+export async function showReport(jobId) {
+  const report = await call(`/v1/jobs/${encodeURIComponent(jobId)}/report`);
+  setText(byId("verdict-text"), report.verdict ?? "");
+  byId("findings").replaceChildren(...(report.findings ?? []).map(finding));
+  byId("verdict").hidden = false;
+}
+
+const SEVERITIES = { ok: "good", good: "good", none: "good", info: "info", minor: "info", warning: "warning", moderate: "warning" };
+
+function finding({ name, severity, text, evidence }) {
+  const look = SEVERITIES[String(severity).toLowerCase()] ?? "severe";
+  const facts = Object.entries(evidence ?? {}).filter(([, value]) => value === null || typeof value !== "object");
+  const list = facts.flatMap(([key, value]) => [
+    el("dt", {}, key.replaceAll("_", " ")),
+    el("dd", {}, typeof value === "number" ? number(value) : String(value ?? "–")),
+  ]);
+  return el(
+    "li",
+    { class: `finding finding-${look}` },
+    el("p", { class: "finding-head" }, el("strong", {}, String(name).replaceAll("_", " ")), el("span", { class: "badge" }, String(severity))),
+    el("p", {}, text ?? ""),
+    facts.length ? el("details", {}, el("summary", {}, "Evidence"), el("dl", { class: "facts" }, ...list)) : null,
+  );
+}
