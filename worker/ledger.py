@@ -172,7 +172,7 @@ class Ledger:
         again = {"attempt": attempt + 1, "message": message, **fresh, **values}
         return self._move(job_id, attempt, State.RUNNING, State.QUEUED, **again)
 
-    def _move(self, job_id: str, attempt: int, old: State, new: State, **values: Any) -> bool:
+    def _move(self, job_id: str, attempt: int, old: State, new: State, /, **values: Any) -> bool:
         assert new in TRANSITIONS[old], (old, new)
         if new in FINISHED:
             values = {"finished_at": time.time(), "eta_s": None, **values}

@@ -207,6 +207,7 @@ class _Attempt:
             self._record_cancel()
             return
         self._folder.publish(self._job.attempt)
+        log.info("job %s: attempt %d published its results", self._job.id, self._job.attempt)
         self._record_success()
 
     def _record_success(self) -> None:

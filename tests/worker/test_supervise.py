@@ -1,0 +1,214 @@
+"""One attempt from claim to end, with a real engine process around a fake engine."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from worker.contract import ErrorKind, State
+from worker.jobfolder import JobFolder
+from worker.journal import read_events
+from worker.ledger import Job, Ledger
+from worker.settings import WorkerSettings
+from worker.supervise import supervise
+
+NewJob = Callable[..., Job]
+pytestmark = pytest.mark.usefixtures("keep_sigterm")
+
+
+@pytest.fixture
+def run(settings: WorkerSettings, ledger: Ledger) -> Callable[[Job], Job]:
+    """Supervise the job's present attempt and return what became of it."""
+
+    def supervised(job: Job) -> Job:
+        supervise(settings, ledger, job.id, job.attempt)
+        found = ledger.get(job.id)
+        assert found is not None
+        return found
+
+    return supervised
+
+
+Run = Callable[[Job], Job]
+
+
+def later(seconds: float, action: Callable[[], object]) -> threading.Timer:
+    timer = threading.Timer(seconds, action)
+    timer.start()
+    return timer
+
+
+def when_running(ledger: Ledger, job: Job, action: Callable[[], object]) -> threading.Thread:
+    """Act once the engine has spoken."""
+
+    def wait() -> None:
+        for _ in range(500):
+            found = ledger.get(job.id)
+            if (found is not None and found.message == "Reading") or (found and found.stage == "level"):
+                action()
+                return
+            time.sleep(0.02)
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    return thread
+
+
+def test_success(run: Run, new_job: NewJob, tmp_path: Path) -> None:
+    job = run(new_job(steps=4))
+    folder = JobFolder(tmp_path, job.id)
+    assert (job.state, job.progress, job.error_kind) == (State.SUCCEEDED, 1.0, None)
+    assert folder.published()
+    assert not folder.scan.exists() and not list(folder.path.glob("attempt-*"))
+    events = read_events(folder.events, 0, 100)
+    assert [e["stage"] for e in events] == ["read", "level", "level", "level", "level"]
+    assert [e["number"] for e in events] == [1, 2, 3, 4, 5]
+    assert "a stray print" in folder.log.read_text()
+
+
+@pytest.mark.parametrize(
+    ("end", "kind", "words"),
+    [
+        ("bad_input", ErrorKind.BAD_INPUT, "projections.tif: page 3 is torn"),
+        ("diverged", ErrorKind.CANNOT_RECONSTRUCT, "the geometry may be mirrored"),
+        ("memory", ErrorKind.OUT_OF_MEMORY, "not enough memory"),
+        ("full", ErrorKind.DISK_FULL, "disk filled up"),
+        ("bug", ErrorKind.CRASHED, "ZeroDivisionError"),
+    ],
+)
+def test_errors_have_kinds_and_words(run: Run, new_job: NewJob, end: str, kind: ErrorKind, words: str) -> None:
+    job = run(new_job(end=end))
+    assert (job.state, job.error_kind) == (State.FAILED, kind)
+    assert words in (job.error_message or "")
+    assert "secret detail" not in (job.error_message or "")
+
+
+def test_a_killed_engine_is_tried_again_but_not_for_ever(run: Run, new_job: NewJob) -> None:
+    job = run(new_job(end="killed"))
+    assert (job.state, job.attempt) == (State.QUEUED, 2)
+    job = run(job)
+    assert (job.state, job.attempt) == (State.QUEUED, 3)
+    job = run(job)
+    assert (job.state, job.error_kind) == (State.FAILED, ErrorKind.CRASHED)
+    assert "SIGKILL" in (job.error_message or "")
+
+
+def test_the_engine_knows_no_secrets(
+    run: Run, new_job: NewJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPLATCT_REDIS_URL", "redis://:password@host/0")
+    monkeypatch.setenv("DATABASE_PASSWORD", "password")
+    job = run(new_job())
+    told = JobFolder(tmp_path, job.id).log.read_text()
+    assert "environment: " in told and "PATH" in told
+    assert "SPLATCT_" not in told and "DATABASE" not in told and "password" not in told
+
+
+def test_cancel_between_events(run: Run, ledger: Ledger, new_job: NewJob, tmp_path: Path) -> None:
+    job = new_job(steps=2000, pause=0.05)
+    thread = when_running(ledger, job, lambda: ledger.ask_cancel(job.id))
+    started = time.monotonic()
+    ended = run(job)
+    thread.join()
+    assert ended.state is State.CANCELLED and time.monotonic() - started < 15
+    assert not JobFolder(tmp_path, job.id).published()
+
+
+def test_cancel_an_engine_that_does_not_listen(run: Run, ledger: Ledger, new_job: NewJob) -> None:
+    job = new_job(deaf=True)
+    thread = when_running(ledger, job, lambda: ledger.ask_cancel(job.id))
+    assert run(job).state is State.CANCELLED
+    thread.join()
+
+
+def test_sigterm_hands_the_job_back(run: Run, ledger: Ledger, new_job: NewJob) -> None:
+    job = new_job(steps=2000, pause=0.05)
+    thread = when_running(ledger, job, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    ended = run(job)
+    thread.join()
+    assert (ended.state, ended.attempt, ended.crashes) == (State.QUEUED, 2, 0)
+
+
+def test_time_limit(ledger: Ledger, new_job: NewJob, settings: WorkerSettings) -> None:
+    job = new_job(steps=2000, pause=0.05)
+    supervise(settings.model_copy(update={"job_seconds": 1.0}), ledger, job.id, 1)
+    ended = ledger.get(job.id)
+    assert ended is not None and (ended.state, ended.error_kind) == (State.FAILED, ErrorKind.TIMEOUT)
+
+
+def test_a_job_that_was_taken_away_is_dropped(run: Run, ledger: Ledger, new_job: NewJob, tmp_path: Path) -> None:
+    job = new_job(steps=2000, pause=0.05)
+    claimed = []
+
+    def take_away() -> None:
+        found = ledger.get(job.id)
+        assert found is not None
+        claimed.append(ledger.crashed(found, "The worker died"))
+
+    thread = when_running(ledger, job, take_away)
+    ended = run(job)
+    thread.join()
+    assert claimed == [True]
+    assert (ended.state, ended.attempt) == (State.QUEUED, 2)
+    assert not JobFolder(tmp_path, job.id).published()
+
+
+def test_a_locked_job_is_left_alone(run: Run, new_job: NewJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("worker.supervise.LOCK_WAIT_S", 0.2)
+    job = new_job()
+    with JobFolder(tmp_path, job.id).lock() as lock:
+        assert lock is not None
+        assert run(job).state is State.QUEUED
+
+
+def test_delivered_twice_runs_once(run: Run, new_job: NewJob, tmp_path: Path) -> None:
+    job = new_job()
+    done = run(job)
+    inode = JobFolder(tmp_path, job.id).results.stat().st_ino
+    assert run(job) == done
+    assert JobFolder(tmp_path, job.id).results.stat().st_ino == inode
+
+
+def test_published_but_not_recorded_is_recorded_without_running_again(
+    run: Run, ledger: Ledger, new_job: NewJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Killed(BaseException):
+        pass
+
+    def die(*_: object) -> bool:
+        raise Killed
+
+    job = new_job()
+    with monkeypatch.context() as patch:
+        patch.setattr(Ledger, "succeed", die)
+        with pytest.raises(Killed):
+            run(job)
+    folder = JobFolder(tmp_path, job.id)
+    left = ledger.get(job.id)
+    assert left is not None and left.state is State.RUNNING and folder.published()
+    inode = folder.results.stat().st_ino
+    assert ledger.crashed(left, "The worker died")  # as if the reconcile loop had not looked at the results
+    again = ledger.get(job.id)
+    assert again is not None and run(again).state is State.SUCCEEDED
+    assert folder.results.stat().st_ino == inode
+
+
+def test_cancelled_after_the_rename_leaves_no_results(
+    run: Run, ledger: Ledger, new_job: NewJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish = JobFolder.publish
+
+    def publish_then_cancel(self: JobFolder, number: int) -> None:
+        publish(self, number)
+        ledger.ask_cancel(self.path.name)
+
+    monkeypatch.setattr(JobFolder, "publish", publish_then_cancel)
+    job = run(new_job())
+    assert job.state is State.CANCELLED
+    assert not JobFolder(tmp_path, job.id).results.exists()
