@@ -18,10 +18,11 @@ from typing import TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-Number = float | None  # None or not finite: nothing is drawn there
+Number = float | None  # None, not finite or absurdly large: nothing is drawn there
 
 WIDTH, HEIGHT = 720, 220
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 12, 12, 40
+_ABSURD, _NOTHING = 1e30, 1e-30
 _MARKED = 120  # up to so many points each gets a dot
 
 
@@ -46,13 +47,13 @@ def number_text(value: float) -> str:
 
 def ticks(low: float, high: float, about: int = 5) -> list[float]:
     """Round numbers that cover low to high, about so many."""
-    step = 10 ** math.floor(math.log10((high - low) / about))
+    step = 10.0 ** math.floor(math.log10((high - low) / about))
     for factor in (1, 2, 5, 10):
         if (high - low) / (step * factor) <= about:
             step *= factor
             break
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
-    return [round(k * step, 12) for k in range(first, last + 1)]
+    return [k * step for k in range(first, last + 1)]
 
 
 def line_chart(
@@ -67,7 +68,7 @@ def line_chart(
                 spread = sigma if _drawn(sigma) else 0.0
                 ends += [value - spread, value + spread]
     low, high = min(ends), max(ends)
-    marks = ticks(low, high if high > low else low + 1)
+    marks = ticks(low, high if high - low > _NOTHING else low + 1)
     low, high = marks[0], marks[-1]
     left, right = (min(x), max(x)) if len(x) else (0.0, 1.0)
     if right <= left:
@@ -118,7 +119,7 @@ def _legend(series: Sequence[Series]) -> str:
 
 
 def _drawn(value: Number) -> TypeGuard[float]:
-    return value is not None and math.isfinite(value)
+    return value is not None and abs(value) < _ABSURD
 
 
 def _path(points: Sequence[tuple[str, str] | None]) -> str:

@@ -127,8 +127,9 @@ def _text(value: Any) -> str:
 
 
 def _number(value: Any) -> Number:
-    usable = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return float(value) if usable and math.isfinite(value) else None
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        return None
+    return float(value) if abs(value) < 1e30 else None  # neither nan nor inf is
 
 
 def _column(views: Sequence[dict[str, Any]], key: str, component: int | None = None) -> list[Number]:
@@ -148,7 +149,7 @@ def _view_charts(views: Sequence[dict[str, Any]]) -> str:
     if not views:
         return ""
     indices = [_number(view.get("index")) for view in views]
-    x = [float(k) if index is None else index for k, index in enumerate(indices)]
+    x = [float(k) if index is None or abs(index) > 1e9 else index for k, index in enumerate(indices)]
     panels = [
         _panel(
             "Residual of each view",
@@ -220,7 +221,8 @@ def _slices(volume: NDArray[np.float32], grid: VolumeGrid) -> str:
         shrink = _SHOWN_SLICE / max(height_mm, width_mm)
         size = max(1, round(width_mm * shrink)), max(1, round(height_mm * shrink))
         position = grid.axes_mm()[2 - axis][index]
-        caption = f"{across} = {number_text(float(position))} mm"
+        right, up = ("xy", "xz", "yz")[axis]
+        caption = f"{across} = {number_text(float(position))} mm ({right} to the right, {up} up)"
         figures.append(
             f"<figure>{image_tag(gray, f'slice at {caption}', *size)}<figcaption>{caption}</figcaption></figure>"
         )
