@@ -60,7 +60,8 @@ function showDetails(job) {
 }
 
 async function showResults() {
-  const files = (await call(`${url}/results`)).files;
+  const manifest = await call(`${url}/results`);
+  const files = manifest.files;
   const path = (file) => `${url}/results/${file.name.split("/").map(encodeURIComponent).join("/")}`;
   byId("file-rows").replaceChildren(
     ...files.map((file) =>
@@ -77,7 +78,7 @@ async function showResults() {
   const named = new Map(files.map((file) => [file.name, file]));
   const parts = [];
   if (named.has("report.json")) parts.push(showReport(id));
-  if (named.has("volume.tif")) parts.push(showSlices(id));
+  if (named.has("volume.tif")) parts.push(showSlices(id, manifest.volume?.voxel_mm));
   if (named.has("poses.json")) parts.push(showPoses(path(named.get("poses.json"))));
   const failed = (await Promise.allSettled(parts)).filter((part) => part.status === "rejected");
   if (failed.length) notice(`Some results cannot be shown: ${failed.map((part) => part.reason.message).join("; ")}`);

@@ -16,7 +16,8 @@ export async function showPoses(url) {
   shift.show(components(views, "translation_mm"));
   residual.show([{ name: "residual", points: views.map((view) => [view.index, view.residual_rms]) }]);
   residual.node.hidden = !views.some((view) => Number.isFinite(view.residual_rms));
-  byId("static").replaceChildren(...constants(poses.static ?? {}));
+  const notes = (poses.notes ?? []).map((note) => el("p", { class: "muted" }, note));
+  byId("static").replaceChildren(...notes, ...constants(poses.static ?? {}));
 }
 
 function components(views, key) {
@@ -27,18 +28,21 @@ function components(views, key) {
 }
 
 function constants(found) {
-  const rows = Object.entries(found).map(([name, value]) => [el("dt", {}, name.replaceAll("_", " ")), el("dd", {}, told(value))]);
+  const rows = Object.entries(found).map(([name, value]) => [el("dt", {}, plain(name)), el("dd", {}, told(name, value))]);
   if (rows.length === 0) return [];
   return [el("h3", {}, "Constant over the scan"), el("dl", { class: "facts" }, ...rows.flat())];
 }
 
-function told(value) {
-  if (typeof value === "number") return number(value, 4);
+const UNITS = { px: "px", deg: "°", mm: "mm" };
+const NAMES = { cor: "centre of rotation, column" };
+
+function plain(name) {
+  const bare = name.replace(/_(px|deg|mm)$/, "");
+  return NAMES[bare] ?? bare.replaceAll("_", " ");
+}
+
+function told(name, value) {
   if (value === null) return "not determined";
-  if (typeof value !== "object") return String(value);
-  if (typeof value.value === "number") {
-    const sigma = Number.isFinite(value.sigma) ? ` ± ${number(value.sigma, 2)}` : "";
-    return `${number(value.value, 4)}${sigma}`;
-  }
-  return JSON.stringify(value);
+  const unit = UNITS[name.split("_").at(-1)];
+  return `${number(value, 5)}${unit ? ` ${unit}` : ""}`;
 }

@@ -5,15 +5,17 @@ import { byId, el, number, setText } from "./dom.js";
 
 export async function showReport(jobId) {
   const report = await call(`/v1/jobs/${encodeURIComponent(jobId)}/report`);
-  setText(byId("verdict-text"), report.verdict ?? "");
-  byId("findings").replaceChildren(...(report.findings ?? []).map(finding));
+  setText(byId("verdict-text"), [report.verdict ?? []].flat().join("\n"));
+  const worstFirst = (report.findings ?? []).toSorted((a, b) => rank(a) - rank(b));
+  byId("findings").replaceChildren(...worstFirst.map(finding));
   byId("verdict").hidden = false;
 }
 
-const SEVERITIES = { ok: "good", good: "good", none: "good", info: "info", minor: "info", warning: "warning", moderate: "warning" };
+const SEVERITIES = ["problem", "warning", "note", "ok"];
+const rank = ({ severity }) => (SEVERITIES.indexOf(severity) + SEVERITIES.length + 1) % (SEVERITIES.length + 1);
 
 function finding({ name, severity, text, evidence }) {
-  const look = SEVERITIES[String(severity).toLowerCase()] ?? "severe";
+  const look = SEVERITIES.includes(severity) ? severity : "note";
   const facts = Object.entries(evidence ?? {}).filter(([, value]) => value === null || typeof value !== "object");
   const list = facts.flatMap(([key, value]) => [
     el("dt", {}, key.replaceAll("_", " ")),
