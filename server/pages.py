@@ -1,4 +1,7 @@
-"""The status page: two HTML shells. Their scripts, in static/, read everything from the API."""
+"""The status page: two HTML shells. Their scripts, in static/, read everything from the API.
+
+The app mounts static/ at /static.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,6 @@ from fastapi import APIRouter, Request
 from fastapi import Path as InPath
 from fastapi.responses import HTMLResponse
 from fastapi.templating import Jinja2Templates
-
-STATIC = Path(__file__).parent / "static"  # the app mounts it at /static
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 

@@ -27,6 +27,23 @@ export function number(value, digits = 3) {
   return size >= 1e5 || size < 1e-4 ? value.toExponential(digits - 1) : String(Number(value.toPrecision(digits)));
 }
 
+const UNITS = { px: "px", deg: "°", mm: "mm", s: "s" };
+const NAMES = { cor: "centre of rotation, column" };
+const unitOf = (name) => UNITS[name.split("_").at(-1)];
+
+// "roll_deg" as people say it; its unit goes to the value.
+export function plain(name) {
+  const bare = unitOf(name) ? name.slice(0, name.lastIndexOf("_")) : name;
+  return NAMES[bare] ?? bare.replaceAll("_", " ");
+}
+
+export function quantity(name, value) {
+  if (value === null) return "not determined";
+  if (typeof value !== "number") return String(value);
+  const unit = unitOf(name);
+  return `${number(value, 6)}${unit ? ` ${unit}` : ""}`;
+}
+
 export function bytes(size) {
   for (const unit of ["B", "kB", "MB", "GB"]) {
     if (size < 1000) return `${unit === "B" ? size : size.toFixed(1)} ${unit}`;

@@ -64,13 +64,13 @@ async function showResults() {
   const files = manifest.files;
   const path = (file) => `${url}/results/${file.name.split("/").map(encodeURIComponent).join("/")}`;
   byId("file-rows").replaceChildren(
-    ...files.map((file) =>
+    ...[...files, { name: "manifest.json" }].map((file) =>
       el(
         "tr",
         {},
         el("th", { scope: "row" }, el("a", { href: path(file), download: file.name.endsWith(".html") ? null : true }, file.name)),
-        el("td", {}, bytes(file.size)),
-        el("td", {}, el("code", { title: file.sha256 }, `${file.sha256.slice(0, 12)}…`)),
+        el("td", {}, file.sha256 ? bytes(file.size) : ""),
+        el("td", {}, file.sha256 ? el("code", { title: file.sha256 }, `${file.sha256.slice(0, 12)}…`) : ""),
       ),
     ),
   );

@@ -2,7 +2,7 @@
 
 import { call } from "./api.js";
 import { chart } from "./chart.js";
-import { byId, el, number } from "./dom.js";
+import { byId, el, plain, quantity } from "./dom.js";
 
 export async function showPoses(url) {
   const poses = await call(url);
@@ -28,21 +28,7 @@ function components(views, key) {
 }
 
 function constants(found) {
-  const rows = Object.entries(found).map(([name, value]) => [el("dt", {}, plain(name)), el("dd", {}, told(name, value))]);
+  const rows = Object.entries(found).map(([name, value]) => [el("dt", {}, plain(name)), el("dd", {}, quantity(name, value))]);
   if (rows.length === 0) return [];
   return [el("h3", {}, "Constant over the scan"), el("dl", { class: "facts" }, ...rows.flat())];
-}
-
-const UNITS = { px: "px", deg: "°", mm: "mm" };
-const NAMES = { cor: "centre of rotation, column" };
-
-function plain(name) {
-  const bare = name.replace(/_(px|deg|mm)$/, "");
-  return NAMES[bare] ?? bare.replaceAll("_", " ");
-}
-
-function told(name, value) {
-  if (value === null) return "not determined";
-  const unit = UNITS[name.split("_").at(-1)];
-  return `${number(value, 5)}${unit ? ` ${unit}` : ""}`;
 }

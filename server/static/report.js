@@ -1,7 +1,7 @@
 // The verdict and the findings behind it.
 
 import { call } from "./api.js";
-import { byId, el, number, setText } from "./dom.js";
+import { byId, el, plain, quantity, setText } from "./dom.js";
 
 export async function showReport(jobId) {
   const report = await call(`/v1/jobs/${encodeURIComponent(jobId)}/report`);
@@ -14,12 +14,16 @@ export async function showReport(jobId) {
 const SEVERITIES = ["problem", "warning", "note", "ok"];
 const rank = ({ severity }) => (SEVERITIES.indexOf(severity) + SEVERITIES.length + 1) % (SEVERITIES.length + 1);
 
+// What fits on a line; longer evidence is in report.html.
+const isShort = (value) =>
+  value === null || typeof value !== "object" || (Array.isArray(value) && value.length <= 12 && value.every(isShort));
+
 function finding({ name, severity, text, evidence }) {
   const look = SEVERITIES.includes(severity) ? severity : "note";
-  const facts = Object.entries(evidence ?? {}).filter(([, value]) => value === null || typeof value !== "object");
+  const facts = Object.entries(evidence ?? {}).filter(([, value]) => isShort(value));
   const list = facts.flatMap(([key, value]) => [
-    el("dt", {}, key.replaceAll("_", " ")),
-    el("dd", {}, typeof value === "number" ? number(value) : String(value ?? "–")),
+    el("dt", {}, plain(key)),
+    el("dd", {}, [value].flat().map((one) => quantity(key, one)).join(", ")),
   ]);
   return el(
     "li",

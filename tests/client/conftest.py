@@ -45,7 +45,7 @@ class FakeApi:
     states: list[str] = field(default_factory=lambda: ["queued", "running", "succeeded"])
     error: dict[str, str] | None = None
     commit_answer: Answer | None = None
-    faults: list[tuple[str, Answer | Exception]] = field(default_factory=list)
+    faults: list[tuple[str, Answer | BaseException]] = field(default_factory=list)
     cut_download_at: list[int] = field(default_factory=list)
     uploads: dict[str, bytes] = field(default_factory=dict)
     announced: dict[str, Any] = field(default_factory=dict)
@@ -70,7 +70,7 @@ class FakeApi:
         for index, (start, fault) in enumerate(self.faults):
             if call.startswith(start):
                 del self.faults[index]
-                if isinstance(fault, Exception):
+                if isinstance(fault, BaseException):
                     raise fault
                 return fault
         return self._answer(method, path.removeprefix("/v1"), headers, body)

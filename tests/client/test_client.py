@@ -16,6 +16,7 @@ from splatct_client import (
     ServerUnreachable,
     UnexpectedAnswer,
 )
+from splatct_client.verbs.submit import watch
 
 JOB_ID = "6a1f6f0e-0000-4000-8000-000000000001"
 
@@ -128,6 +129,14 @@ def test_waiting_outlives_a_restart_of_the_server(client, api):
     client.options()
     api.faults = [("GET /v1/jobs", httpx.ConnectError("refused"))] * 3
     assert client.wait(JOB_ID).state == "succeeded"
+
+
+def test_ctrl_c_leaves_the_job_alone_and_says_how_to_go_on(client, api, capsys):
+    api.faults = [("GET /v1/jobs", KeyboardInterrupt())]
+    with pytest.raises(KeyboardInterrupt):
+        watch(client, JOB_ID)
+    assert f"splatct cancel {JOB_ID}" in capsys.readouterr().err
+    assert not any("cancel" in call for call in api.calls)
 
 
 def test_a_download_is_whole_and_leaves_no_part(client, api, tmp_path):

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
+CLIENT = Path(__file__).resolve().parents[2] / "client"
 JOB_ID = "6a1f6f0e-0000-4000-8000-000000000001"
 
 
@@ -22,6 +27,15 @@ def test_help_lists_every_verb(splatct):
     for verb in ("submit", "jobs", "fetch", "cancel"):
         assert f"\n  {verb} " in done.stdout
     assert "exit codes" in done.stdout
+
+
+def test_a_reader_that_leaves_early_is_no_error():
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "splatct_client", "--help"]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, env={"PYTHONPATH": str(CLIENT)}, timeout=60)
+    os.close(writing)
+    assert done.returncode == 141 and done.stderr == b""
 
 
 def test_the_help_of_a_verb_loads_no_http_library(splatct):

@@ -104,9 +104,12 @@ def test_a_job_from_the_queue_to_its_results(page: Page, stage: Stage) -> None:
     findings = page.locator("#findings > li")
     expect(findings).to_have_count(3)
     expect(findings.nth(0)).to_contain_text("problem")  # the worst comes first
-    expect(page.get_by_role("img", name="Rotation: about x, y, z, ° over view, 225 points")).to_be_visible()
+    rotation = page.get_by_role("img", name="Rotation: about x, y, z, ° over view, 225 points")
+    rotation.hover(position={"x": 58, "y": 80})
+    readout = page.locator("figure", has=rotation).locator("output")
+    expect(readout).to_have_text("view 0: x 0 ± 0.05, y 0 ± 0.06, z 0 ± 0.02")
     expect(page.locator("#static")).to_contain_text("not determined")
-    expect(page.locator("#file-rows tr")).to_have_count(4)
+    expect(page.locator("#file-rows tr")).to_have_count(5)
     expect(page.locator("#progress-panel")).to_be_hidden()
     check_slices(page)
 
@@ -165,6 +168,22 @@ def test_a_job_is_cancelled_from_the_page(page: Page, stage: Stage) -> None:
     expect(page.locator("#state")).to_have_text("cancelled")
     row = stage.ledger.get(job)
     assert row is not None and row.state is State.CANCELLED
+
+
+def test_waiting_for_nobody_is_explained(browser: Browser, stage: Stage) -> None:
+    stage.job("teapot", created_at=time.time() - 60)
+    page = browser.new_page(base_url=stage.url)  # its console may complain: the server is not ready
+    page.goto("/")
+    expect(page.locator("#notice")).to_contain_text("wait for Redis")
+    page.close()
+
+
+def test_a_job_that_is_not_there(browser: Browser, stage: Stage) -> None:
+    for job in ("6a1f6f0e-0000-4000-8000-000000000001", "nonsense"):
+        page = browser.new_page(base_url=stage.url)
+        page.goto(f"/jobs/{job}")
+        expect(page.get_by_role("heading", level=1)).to_have_text("No such job")
+        page.close()
 
 
 def test_a_new_attempt_starts_its_curve_afresh(page: Page, stage: Stage) -> None:
