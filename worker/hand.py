@@ -28,7 +28,10 @@ MONITORING_S = 5
 class Hand(Worker):
     """Forwards the first SIGTERM to the child, whose supervisor then queues the job again."""
 
+    asked_to_stop = False
+
     def request_stop(self, signum: int, frame: FrameType | None) -> None:
+        self.asked_to_stop = True
         if self.horse_pid:
             os.kill(self.horse_pid, signal.SIGTERM)
         super().request_stop(signum, frame)  # type: ignore[no-untyped-call]
@@ -53,12 +56,14 @@ class WorkLoop:
             try:
                 self._hand = self._make()
                 self._hand.work(logging_level="WARNING")
-                self._stopping = self._stopping or self._hand.shutdown_requested_date is not None
             except RedisError as error:
                 log.warning("Redis is away (%s); trying again", type(error).__name__)
             self._listen()
-            if self._hand is not None and self._hand.horse_pid:
-                self._hand.wait_for_horse()
+            if self._hand is not None:
+                self._stopping = self._stopping or self._hand.asked_to_stop
+                if self._hand.horse_pid:
+                    self._hand.wait_for_horse()
+                self._hand = None
             if not self._stopping:
                 time.sleep(1.0)
 

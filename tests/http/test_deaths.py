@@ -1,0 +1,156 @@
+"""Any part may die at any moment; every job still ends once, and as it should."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from redis import Redis
+
+from .stack import Stack, commit, kill, scan_files, submit
+
+
+def long_job(stack: Stack, steps: int = 40) -> str:
+    return submit(stack.http, commit(stack.http, scan_files(steps=steps, pause=0.05)))
+
+
+def mid_job(stack: Stack, job_id: str) -> None:
+    stack.until(lambda: stack.job(job_id)["stage"] == "level", what="the engine is at work")
+
+
+def publications(stack: Stack, job_id: str) -> int:
+    log = (stack.data.parent / "log.txt").read_text()
+    return sum(job_id in line and "published its results" in line for line in log.splitlines())
+
+
+def test_a_killed_worker_takes_its_engine_along_and_the_job_runs_again_once(stack: Stack) -> None:
+    worker = stack.start_worker()
+    job_id = long_job(stack)
+    mid_job(stack, job_id)
+    assert len(stack.engine_pids()) == 1
+    kill(worker)
+    stack.until(lambda: not stack.engine_pids(), 5, "the engine died with its worker")
+    again = stack.wait(job_id, "queued", seconds=10)
+    assert again["attempt"] == 2
+    stack.start_worker()
+    stack.start_worker()
+    done = stack.wait(job_id, "succeeded", "failed")
+    assert (done["state"], done["attempt"]) == ("succeeded", 2)
+    events = stack.http.get(f"/v1/jobs/{job_id}/events").json()["events"]
+    assert sorted({event.get("attempt", 2) for event in events}) == [1, 2]
+    assert sum(event["stage"] == "read" for event in events) == 2
+    time.sleep(1.5)  # room for a second run, if there were one
+    assert publications(stack, job_id) == 1 and not stack.engine_pids()
+
+
+def test_a_killed_engine_is_started_again(stack: Stack) -> None:
+    stack.start_worker()
+    job_id = long_job(stack)
+    mid_job(stack, job_id)
+    os.kill(stack.engine_pids()[0], signal.SIGKILL)
+    done = stack.wait(job_id, "succeeded", "failed")
+    assert (done["state"], done["attempt"]) == ("succeeded", 2)
+    assert publications(stack, job_id) == 1
+
+
+def test_a_stopped_worker_hands_its_job_back(stack: Stack) -> None:
+    worker = stack.start_worker()
+    job_id = long_job(stack, steps=400)
+    mid_job(stack, job_id)
+    started = time.monotonic()
+    worker.terminate()
+    assert worker.wait(20) == 0
+    assert time.monotonic() - started < 10
+    job = stack.job(job_id)
+    assert (job["state"], job["attempt"]) == ("queued", 2) and not stack.engine_pids()
+
+
+def test_wiping_redis_loses_no_queued_job(stack: Stack) -> None:
+    scan_id = commit(stack.http, scan_files())
+    ids = [submit(stack.http, scan_id) for _ in range(6)]
+    redis = Redis.from_url(stack.redis.url)
+    stack.until(lambda: redis.llen("rq:queue:splatct") == 6, what="six on the queue")
+    redis.flushall()
+    stack.until(lambda: redis.llen("rq:queue:splatct") == 6, what="six on the queue again")
+    redis.flushall()
+    redis.close()
+    stack.start_worker()
+    for job_id in ids:
+        done = stack.wait(job_id, "succeeded", "failed")
+        assert (done["state"], done["attempt"]) == ("succeeded", 1)
+        assert publications(stack, job_id) == 1
+
+
+def test_wiping_redis_does_not_disturb_a_running_job(stack: Stack) -> None:
+    stack.start_worker()
+    job_id = long_job(stack, steps=60)
+    mid_job(stack, job_id)
+    with Redis.from_url(stack.redis.url) as redis:
+        redis.flushall()
+    done = stack.wait(job_id, "succeeded", "failed")
+    assert (done["state"], done["attempt"]) == ("succeeded", 1)
+    after = submit(stack.http, commit(stack.http, scan_files()))  # and the worker goes on
+    assert stack.wait(after, "succeeded", "failed")["state"] == "succeeded"
+
+
+def test_jobs_are_accepted_without_redis_and_run_when_it_is_back(stack: Stack) -> None:
+    stack.redis.kill()
+    job_id = submit(stack.http, commit(stack.http, scan_files()))
+    assert stack.http.get("/readyz").json()["redis"] is False
+    assert stack.job(job_id)["state"] == "queued"
+    stack.redis.start()
+    stack.start_worker()
+    assert stack.wait(job_id, "succeeded", "failed")["state"] == "succeeded"
+
+
+@pytest.mark.slow
+def test_redis_dying_under_a_running_job_costs_it_nothing(stack: Stack) -> None:
+    stack.start_worker()
+    job_id = long_job(stack, steps=500)
+    mid_job(stack, job_id)
+    stack.redis.kill()
+    time.sleep(15)  # past the worker's heartbeats and retries
+    stack.redis.start()
+    done = stack.wait(job_id, "succeeded", "failed", seconds=60)
+    assert (done["state"], done["attempt"]) == ("succeeded", 1)
+    after = submit(stack.http, commit(stack.http, scan_files()))
+    assert stack.wait(after, "succeeded", "failed", seconds=60)["state"] == "succeeded"
+
+
+def test_a_killed_server_forgets_nothing(stack: Stack) -> None:
+    stack.start_worker()
+    running = long_job(stack)
+    scan_id = commit(stack.http, scan_files())
+    queued = submit(stack.http, scan_id)
+    mid_job(stack, running)
+    kill(stack.server)
+    stack.start_server()
+    for job_id in (running, queued):
+        done = stack.wait(job_id, "succeeded", "failed")
+        assert (done["state"], done["attempt"]) == ("succeeded", 1)
+
+
+def test_a_server_killed_between_commit_steps_commits_on_the_next_call(stack: Stack) -> None:
+    from .stack import send
+
+    upload_id = send(stack.http, scan_files())
+    # As if it had died after the files were moved and before the database knew.
+    (stack.data / "uploads" / upload_id / "scan").rename(stack.data / "scans" / upload_id)
+    answer = stack.http.post(f"/v1/uploads/{upload_id}/commit")
+    assert answer.status_code == 201
+    assert submit(stack.http, answer.json()["id"])
+    assert not (stack.data / "uploads" / upload_id).exists()
+
+
+def test_a_cancelled_job_whose_worker_died_ends(stack: Stack) -> None:
+    worker = stack.start_worker()
+    job_id = submit(stack.http, commit(stack.http, scan_files(deaf=True)))
+    stack.until(lambda: stack.job(job_id)["message"] == "Reading", what="the engine is at work")
+    os.kill(worker.pid, signal.SIGSTOP)  # it cannot see the request
+    stack.http.post(f"/v1/jobs/{job_id}/cancel")
+    kill(worker)
+    stack.wait(job_id, "cancelled")
+    assert not list(Path(stack.data / "jobs" / job_id).glob("attempt-*"))
