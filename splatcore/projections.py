@@ -22,6 +22,7 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 MAX_PIXELS = 2**35  # 128 GiB of float32
+_ABSURD = 1e12  # no count and no line integral is as large
 _SMALLEST_FLOAT_TRANSMISSION = 2.0**-16  # of pixels stored as floats: below one count of a 16-bit detector
 _MOST_DARK_FLAT = 0.05  # share of pixels whose flat may fail to exceed the dark
 
@@ -132,17 +133,17 @@ class Conversion:
         total = np.zeros(self.bad.shape, np.float64)
         for stack in stacks:
             for number, page in enumerate(read_pages(stack)):
-                image = page.astype(np.float64)
-                self._finite(image, stack, number)
+                with np.errstate(invalid="ignore"):  # a signalling nan
+                    image = page.astype(np.float64)
+                self._mend(image, stack, number)
                 total += image
         return total * (self.header.scale / sum(stack.pages for stack in stacks))
 
-    def _finite(self, image: NDArray[Any], stack: TiffHeader, number: int) -> None:
-        """Notes pixels that are not finite, unless marked as bad; sets all such to 1."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            if np.isfinite(image.sum()):  # a sum that is finite has finite terms: a fast first look
-                return
-        wrong = ~np.isfinite(image)
+    def _mend(self, image: NDArray[Any], stack: TiffHeader, number: int) -> None:
+        """Notes pixels that are not finite or absurdly large, unless marked as bad; sets all such to 1."""
+        if -_ABSURD < image.min() and image.max() < _ABSURD:  # false for nan
+            return
+        wrong = ~(np.abs(image) < _ABSURD)
         count = int(np.count_nonzero(wrong & ~self.bad))
         image[wrong] = 1.0
         if count:
@@ -153,10 +154,12 @@ class Conversion:
         """Line integrals, view by view in page order. Notes pages that hold pixels which are not finite."""
         for stack in self.stacks.images:
             for number, page in enumerate(read_pages(stack)):
-                with np.errstate(over="ignore"):
+                with np.errstate(over="ignore", invalid="ignore"):
                     image = page.astype(np.float32) * np.float32(self.header.scale)
-                    self._finite(image, stack, number)
-                yield self._fill(self._integrals(image, stack))
+                    self._mend(image, stack, number)
+                    image = self._integrals(image, stack)
+                    self._mend(image, stack, number)
+                yield self._fill(image)
 
     def _integrals(self, image: Image, stack: TiffHeader) -> Image:
         if self.header.kind == "line_integrals":

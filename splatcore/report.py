@@ -127,9 +127,9 @@ def _text(value: Any) -> str:
 
 
 def _number(value: Any) -> Number:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return None
-    return float(value) if abs(value) < 1e30 else None  # neither nan nor inf is
+    return float(value) if -1e30 < value < 1e30 else None  # neither nan nor inf is
 
 
 def _column(views: Sequence[dict[str, Any]], key: str, component: int | None = None) -> list[Number]:

@@ -481,6 +481,37 @@ def test_pixels_that_are_not_finite(tmp_path: Path, value: float) -> None:
     assert "projections.tif, page 8 of 9: 1 pixels" in text
 
 
+def test_a_flat_next_to_nothing_is_caught(tmp_path: Path) -> None:
+    changes = {"/projections/kind": "counts", "/projections/flat": ["flat.tif"]}
+    folder = write_scan(tmp_path, 1 + plain_images(), changes)
+    flat = np.ones((ROWS, COLS))
+    flat[3, 4] = 1e-300
+    write_tiff(folder / "flat.tif", flat)
+    assert "page 1 of 9: 1 pixels" in problems(folder)
+
+
+def test_signalling_nans_are_only_nans(tmp_path: Path) -> None:
+    images = plain_images().astype("float64")
+    images.view("u8")[0, 0, 0] = 0x7FF0000000000001
+    assert "page 1 of 9: 1 pixels" in problems(write_scan(tmp_path, images))
+
+
+@pytest.mark.parametrize(
+    ("offset", "raw", "words"),
+    [
+        (0, b"MMXX", "is not a TIFF file"),
+        (4, b"\xff\xff\xff\xff", "is cut short: the header of page 1"),
+        (8, b"\xff\xff", "is cut short: the header of page 1"),
+    ],
+)
+def test_headers_that_lead_nowhere(tmp_path: Path, offset: int, raw: bytes, words: str) -> None:
+    folder = write_scan(tmp_path)
+    with (folder / "projections.tif").open("r+b") as file:
+        file.seek(offset)
+        file.write(raw)
+    assert words in problems(folder)
+
+
 def test_doubles_too_large_for_floats(tmp_path: Path) -> None:
     images = plain_images("float64")
     images[0, 0, 0] = 1e300
