@@ -36,7 +36,14 @@ def nearest(given: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(given, known, n=1, cutoff=0.6)
     if close:
         return f"did you mean {close[0]!r}?"
-    return "known here: " + ", ".join(known) if known else ""
+    return "known here: " + ", ".join(known[:12]) + (", …" if len(known) > 12 else "") if known else ""
+
+
+def token(key: str) -> str:
+    """A key as one step of a JSON pointer (RFC 6901), fit for a terminal."""
+    text = key if key.isprintable() else ascii(key)[1:-1]
+    text = text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+    return text.replace("~", "~0").replace("/", "~1")
 
 
 class Document:
@@ -108,7 +115,7 @@ class Document:
                     self.note(name, f"is nested deeper than {_MAX_DEPTH} levels")
                     return None
                 items = value.items() if isinstance(value, dict) else enumerate(value)
-                stack += [(item, f"{pointer}/{key}", depth + 1) for key, item in items]
+                stack += [(item, f"{pointer}/{token(str(key))}", depth + 1) for key, item in items]
 
     def object(
         self, value: Any, pointer: str, required: Sequence[str], optional: Sequence[str] = ()
@@ -121,7 +128,7 @@ class Document:
         for key in value:
             if key not in known:
                 unused = [word for word in known if word not in value]
-                self.note(f"{pointer}/{key}", "unknown key", nearest(key, unused))
+                self.note(f"{pointer}/{token(key)}", "unknown key", nearest(key, unused))
         for key in required:
             if key not in value:
                 self.note(f"{pointer}/{key}", "missing")

@@ -149,7 +149,8 @@ def geometry_warnings(header: ScanHeader, grid: VolumeGrid, arc_deg: float) -> l
         found.append(f"only {len(frames)} views")
     if arc_deg < 175:
         found.append(f"the views cover {arc_deg:.0f} degrees only; below 180 parts of the object stay unseen")
-    position = frames.project(np.array([grid.center_mm]))[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):  # a middle level with a source is not seen
+        position = frames.project(np.array([grid.center_mm]))[:, 0]
     seen = np.all((position > -0.5) & (position < np.array([frames.cols, frames.rows]) - 0.5), axis=1)
     if seen.mean() < 0.5:
         found.append(f"the volume's middle falls off the detector in {np.count_nonzero(~seen)} of {len(frames)} views")

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from splatcore.errors import Problem, ScanError
 from splatcore.geometry import Array, Frames
 
 
@@ -56,15 +57,25 @@ class VolumeGrid:
 _MOST_DERIVED_VOXELS = 512**3
 
 
+def _underivable(why: str) -> Problem:
+    return Problem("/volume", f"is left out and cannot be derived from the views: {why}", "give shape and voxel_mm")
+
+
 def grid_from_view(frames: Frames) -> VolumeGrid:
     """The cube-voxelled grid around the rotation axis that the views see: the field of view's width across,
     its height at the axis along z, the voxel as large as a pixel seen at the isocentre (larger where that
-    would exceed 512^3 voxels)."""
+    would exceed 512^3 voxels).
+
+    Raises ScanError where the isocentre does not lie before the sources, or rays run along the axis."""
     cone = frames.beam == "cone"
     isocentre = np.zeros((1, 3))
     middle = frames.pixel_from_world() @ -frames.origin()[..., None]  # [views, 3, 1]
-    column, row = frames.project(isocentre)[:, 0].T - np.array([[(frames.cols - 1) / 2], [(frames.rows - 1) / 2]])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        projected = frames.project(isocentre)
+    column, row = projected[:, 0].T - np.array([[(frames.cols - 1) / 2], [(frames.rows - 1) / 2]])
     depth = middle[:, 2, 0] if cone else np.ones(len(frames))
+    if depth.min() < 1e-6:
+        raise ScanError([_underivable("the isocentre (0, 0, 0) does not lie before the source in every view")])
     pixel = np.sqrt(np.linalg.norm(frames.u, axis=1) * np.linalg.norm(frames.v, axis=1)) * depth
     voxel = float(np.median(pixel))
 
@@ -83,7 +94,9 @@ def grid_from_view(frames: Frames) -> VolumeGrid:
     heights = []  # z where the uppermost and lowest rays pass closest to the axis
     for edge in (-frames.rows / 2, frames.rows / 2):
         point, along = ray(column, np.full_like(column, edge))
-        flat = np.maximum(np.sum(along[:, :2] ** 2, axis=1), 1e-6)
+        flat = np.sum(along[:, :2] ** 2, axis=1)
+        if flat.min() < 0.01:
+            raise ScanError([_underivable("rays run along the rotation axis z")])
         heights.append(point[:, 2] - np.sum(point[:, :2] * along[:, :2], axis=1) / flat * along[:, 2])
     low, high = float(np.min(heights)), float(np.max(heights))
 

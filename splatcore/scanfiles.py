@@ -43,7 +43,7 @@ def find_file(folder: Path, name: object, pointer: str, doc: Document) -> NamedF
             present = sorted(entry.name for entry in (root / path).parent.iterdir() if entry.is_file())[:1000]
         except OSError:
             present = []
-        hint = nearest(path.name, [entry for entry in present if entry != "scan.json"][:8] if present else [])
+        hint = nearest(path.name, [entry for entry in present if entry != "scan.json"])
         doc.note(pointer, f"{shown(name)} does not exist in the scan folder", hint)
     elif not regular:
         doc.note(pointer, f"{shown(name)} is not a regular file")

@@ -242,6 +242,31 @@ def test_volume_from_the_field_of_view(tmp_path: Path) -> None:
     assert scan.volume == grid_from_view(scan.frames)
 
 
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [((0, 0, 0), "does not lie before the source"), ((-10, 3, 0), "does not lie before"), ((1, 0, 99), "along the ro")],
+)
+def test_a_volume_that_cannot_be_derived(tmp_path: Path, source: tuple[float, ...], words: str) -> None:
+    frame = {"source": source, "detector_center": [-200, 0, 0], "u": [0, 1, 0], "v": [0, 0, -1]}
+    if words.startswith("along"):
+        frame |= {"detector_center": [0, 0, -99], "v": [1, 0, 0]}
+    geometry = {"beam": "cone", "detector": {"rows": ROWS, "cols": COLS}, "frames": [frame] * VIEWS}
+    folder = write_scan(tmp_path, changes={"/geometry": geometry, "/volume": ...})
+    assert words in problems(folder)
+    (folder / "scan.json").write_text((folder / "scan.json").read_text()[:-1] + ', "volume": ' + BOX + "}")
+    if source != (0, 0, 0):
+        assert check_scan(folder).volume_shape == (2, 2, 2)
+
+
+BOX = '{"shape": [2, 2, 2], "voxel_mm": [0.1, 0.1, 0.1]}'
+
+
+def test_pointers_are_fit_for_a_terminal(tmp_path: Path) -> None:
+    text = problems(write_scan(tmp_path, changes={"/\x1b[31mred\ud800": 1, "/" + "k" * 500: 2}))
+    assert text.isascii() or "…" in text
+    assert "\x1b" not in text and "\\x1b[31mred" in text and "k" * 100 not in text
+
+
 # --- facts and warnings -------------------------------------------------------------------------------------
 
 
