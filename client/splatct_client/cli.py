@@ -105,7 +105,8 @@ def _dispatch(arguments: list[str]) -> int:
     parser = _Parser(prog=f"splatct {first}", description=verb.HELP, epilog=EPILOG)
     parser.as_json = "--json" in arguments
     verb.configure(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, errors too")
+    with contextlib.suppress(argparse.ArgumentError):  # a verb may declare it itself, to say more about it
+        parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, errors too")
     return int(verb.run(parser.parse_args(arguments[1:])) or 0)
 
 

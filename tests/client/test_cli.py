@@ -50,6 +50,12 @@ def test_json_is_known_to_every_verb(verb):
     assert seen == [True, False]
 
 
+def test_a_verb_may_declare_json_itself(verb):
+    verb.configure = lambda parser: parser.add_argument("--json", action="store_true", help="says more")
+    verb.run = lambda args: 7 if args.json else 8
+    assert cli.main(["other", "--json"]) == 7
+
+
 def test_an_error_on_purpose_is_told_in_one_line(verb, capsys):
     verb.run = raising(OptionsError("splats: got 3"))
     assert cli.main(["other"]) == 2
