@@ -34,11 +34,11 @@ def _volume(path: Path) -> Any:
     if not path.is_file():
         raise FileNotFoundError(path)
     with tifffile.TiffFile(path, is_ome=False) as tiff:
-        page = tiff.pages.first
-        rows, columns = page.shape
-        shape = (len(tiff.pages), rows, columns)
-        assert page.dtype is not None
-        offset, dtype = page.dataoffsets[0], page.dtype.newbyteorder(tiff.byteorder)
+        page, offset = tiff.pages.first, tiff.series[0].dataoffset
+        if offset is None or page.dtype is None:
+            raise ValueError(f"{path} is not one contiguous array")
+        shape = (len(tiff.pages), *page.shape)
+        dtype = page.dtype.newbyteorder(tiff.byteorder)
     return np.memmap(path, dtype, "r", offset, shape)
 
 

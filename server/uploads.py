@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import threading
 from pathlib import Path as FolderPath
@@ -73,6 +74,10 @@ async def put_file(upload_id: UUID, name: FileName, request: Request, service: S
         raise not_found("upload") from None
     except Mismatch as mismatch:
         raise invalid(f"The file was refused: {mismatch}.", [Problem(name, str(mismatch), "send it again")]) from None
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise ApiProblem(507, "no-room", "The disk is full.") from None
     except ClientDisconnect:
         raise ApiProblem(400, "interrupted", "The connection ended before the file did.") from None
     return FileOut(name=name, size=file.size, received=file.size, complete=True, sha256=sha256)

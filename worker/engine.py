@@ -105,7 +105,8 @@ def _classify(error: Exception) -> tuple[Exit, str]:
     # torch has its own class on the GPU and a plain RuntimeError on the CPU; neither is imported here
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "allocate memory" in text:
         return Exit.OUT_OF_MEMORY, "There is not enough memory for this scan. Try quality preview, or a smaller volume."
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+    cause = error if isinstance(error, OSError) else error.__cause__  # the result writer wraps what it meets
+    if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
         return Exit.DISK_FULL, "The disk filled up while the results were written. Make room and submit the job again."
     return Exit.BUG, f"The engine failed unexpectedly ({type(error).__name__}). The log holds the details."
 

@@ -17,6 +17,8 @@ import sqlalchemy as sa
 from worker.contract import ACTIVE, FINISHED, MAX_CRASHES, TRANSITIONS, ErrorKind, State
 from worker.database import Database, metadata
 
+_STATE = sa.Enum(State, native_enum=False, length=16, values_callable=lambda states: [s.value for s in states])
+
 jobs = sa.Table(
     "jobs",
     metadata,
@@ -25,7 +27,7 @@ jobs = sa.Table(
     sa.Column("scan_id", sa.String(36), nullable=False, index=True),
     sa.Column("scan_name", sa.Text, nullable=False),
     sa.Column("options", sa.JSON, nullable=False),
-    sa.Column("state", sa.String(16), nullable=False, index=True),
+    sa.Column("state", _STATE, nullable=False, index=True),
     sa.Column("stage", sa.String(32), nullable=False, default=""),
     sa.Column("message", sa.Text, nullable=False, default=""),
     sa.Column("progress", sa.Float, nullable=False, default=0.0),
@@ -125,14 +127,14 @@ class Ledger:
         update = jobs.update().where(mine, alive).values(heartbeat=time.time(), **values).returning(jobs.c.state)
         with self._database.writing() as write:
             row = write.execute(update).one_or_none()
-        return None if row is None else State(row.state)
+        return None if row is None else row.state
 
     def succeed(self, job_id: str, attempt: int) -> bool:
         end = {"stage": "done", "message": "Done", "progress": 1.0}
         return self._move(job_id, attempt, State.RUNNING, State.SUCCEEDED, **end)
 
     def fail(self, job_id: str, attempt: int, kind: ErrorKind, message: str, was: State = State.RUNNING) -> bool:
-        error = {"error_kind": kind, "error_message": message, "message": "Failed"}
+        error = {"error_kind": kind.value, "error_message": message, "message": "Failed"}
         return self._move(job_id, attempt, was, State.FAILED, **error)
 
     def end_cancel(self, job_id: str, attempt: int) -> bool:
@@ -182,5 +184,4 @@ class Ledger:
 
 
 def _job(row: sa.Row[Any]) -> Job:
-    values = dict(row._mapping)
-    return Job(**{**values, "state": State(values["state"])})
+    return Job(**row._mapping)

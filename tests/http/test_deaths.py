@@ -154,3 +154,36 @@ def test_a_cancelled_job_whose_worker_died_ends(stack: Stack) -> None:
     kill(worker)
     stack.wait(job_id, "cancelled")
     assert not list(Path(stack.data / "jobs" / job_id).glob("attempt-*"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay_s", [0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0, 1.3])
+def test_a_worker_killed_at_any_moment_costs_one_attempt_at_most(stack: Stack, delay_s: float) -> None:
+    worker = stack.start_worker()
+    stack.until(lambda: stack.http.get("/readyz").status_code == 200, what="a worker")
+    job_id = submit(stack.http, commit(stack.http, scan_files(steps=5, pause=0.05)))
+    time.sleep(delay_s)
+    kill(worker)
+    stack.start_worker()
+    done = stack.wait(job_id, "succeeded", "failed", seconds=40)
+    assert done["state"] == "succeeded" and done["attempt"] <= 2
+    assert publications(stack, job_id) <= 1  # 0 if it was killed between the rename and the log line
+    assert stack.http.get(f"/v1/jobs/{job_id}/results").status_code == 200
+    assert sorted(p.name for p in (stack.data / "jobs" / job_id).glob("*-*")) == []
+
+
+@pytest.mark.slow
+def test_a_large_upload_needs_little_memory(stack: Stack) -> None:
+    size, chunk = 300 << 20, b"x" * (1 << 20)
+    files = [{"name": "scan.json", "size": size}]
+    upload_id = stack.http.post("/v1/uploads", json={"name": "large", "files": files}).json()["id"]
+
+    def peak_kib() -> int:
+        status = Path(f"/proc/{stack.server.pid}/status").read_text()
+        return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1])
+
+    before = peak_kib()
+    body = (chunk for _ in range(300))
+    answer = stack.http.put(f"/v1/uploads/{upload_id}/files/scan.json", content=body, timeout=120)
+    assert answer.status_code == 200
+    assert peak_kib() - before < 40 << 10

@@ -1,0 +1,31 @@
+"""Settings: from the environment, handed on to children, and never an open door."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from server.settings import Settings, SettingsError
+
+
+def test_environment_there_and_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPLATCT_PORT", "9000")
+    monkeypatch.setenv("SPLATCT_REDIS_URL", "redis://:secret@example/1")
+    settings = Settings(data=tmp_path)
+    assert (settings.port, settings.data) == (9000, tmp_path)
+    assert "secret" not in repr(settings)
+    for name, value in settings.to_environment().items():
+        monkeypatch.setenv(name, value)
+    assert Settings() == settings
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "example.org", ""])
+def test_only_loopback_is_served(host: str) -> None:
+    with pytest.raises(SettingsError, match="no authentication"):
+        Settings(host=host).require_loopback()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost", "127.1.2.3"])
+def test_loopback_names(host: str) -> None:
+    Settings(host=host).require_loopback()
