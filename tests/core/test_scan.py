@@ -618,8 +618,10 @@ def test_compression_without_a_decoder_is_refused(tmp_path: Path) -> None:
     assert "page 1 of 9: is compressed with LZW" in problems(folder)
 
 
-def test_a_small_file_that_claims_to_be_huge_is_not_decoded(tmp_path: Path) -> None:
-    folder = write_scan(tmp_path, changes={"/geometry/detector/rows": 30_000, "/geometry/detector/cols": 30_000})
+@pytest.mark.parametrize("options", [{}, {"compression": "zlib"}])
+def test_a_small_file_that_claims_to_be_huge_is_not_decoded(tmp_path: Path, options: dict[str, Any]) -> None:
+    changes = {"/geometry/detector/rows": 30_000, "/geometry/detector/cols": 30_000}
+    folder = write_scan(tmp_path, changes=changes, **options)
     path = folder / "projections.tif"
     raw = bytearray(path.read_bytes())
     for tag in (256, 257, 278):  # width, length, rows per strip
@@ -627,6 +629,17 @@ def test_a_small_file_that_claims_to_be_huge_is_not_decoded(tmp_path: Path) -> N
         raw[at + 2 : at + 12] = struct.pack("<HII", 4, 1, 30_000)
     path.write_bytes(raw)
     assert "claims 3600000000 bytes of pixels" in problems(folder)
+
+
+def test_a_page_that_stores_less_than_it_claims_is_refused(tmp_path: Path) -> None:
+    """It would otherwise read as zeros from there on."""
+    folder = write_scan(tmp_path)
+    path = folder / "projections.tif"
+    raw = bytearray(path.read_bytes())
+    at = raw.index(struct.pack("<HHI", 279, 4, 1))  # StripByteCounts of the first page
+    raw[at + 8 : at + 12] = struct.pack("<I", ROWS * COLS * 2)
+    path.write_bytes(raw)
+    assert "page 1 of 9: claims 768 bytes of pixels and stores 384" in problems(folder)
 
 
 def test_pages_in_a_circle(tmp_path: Path) -> None:
