@@ -39,10 +39,11 @@ struct GridIn {
   double center[3];  // x y z, mm
 };
 
-// Residual statistics and the normal equations of one view's rigid motion (omega rad, tau mm; world axes).
+// Residual statistics and normal equations of one view along 12 directions: the rigid motion of the object
+// (omega rad, tau mm; world axes) and the six strains of the splats' means (xx, yy, zz, yz, xz, xy).
 struct MotionNormal {
-  double hessian[36];   // sum w dI dI'
-  double gradient[6];   // sum w dI (I - target)
+  double hessian[144];  // sum w dI dI'
+  double gradient[12];  // sum w dI (I - target)
   double weighted_ss;   // sum w r^2
   double residual_ss;   // sum r^2
   double residual_abs;  // sum |r|
@@ -64,7 +65,7 @@ class Renderer {
   // mask [rows, cols] weights the pixels, may be null. data_range scales SSIM's constants. Returns the loss.
   virtual double loss_vjp(const FrameIn&, const SplatsIn<T>&, const T* target, const T* mask, double huber_delta,
                           double dssim, double data_range, const SplatsOut<T>& v) = 0;
-  // Gauss-Newton sums of a view's rigid motion, without ever holding a whole derivative image.
+  // Gauss-Newton sums of a view, without ever holding a whole derivative image.
   virtual MotionNormal motion_normal(const FrameIn&, const SplatsIn<T>&, const T* target, const T* mask,
                                      double huber_delta) = 0;
 };

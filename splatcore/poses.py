@@ -20,8 +20,8 @@ from splatcore.splats import Floats, Splats
 class Normals:
     """Normal equations of every view at its present pose. Units: rad, mm, unitless line integrals."""
 
-    hessian: Array  # [views, 6, 6]
-    gradient: Array  # [views, 6]
+    hessian: Array  # [views, 12, 12]: omega, tau, strain
+    gradient: Array  # [views, 12]
     weighted_ss: Array  # [views] sum w r^2
     residual_ss: Array  # [views] sum r^2
     residual_abs: Array  # [views] sum |r|
@@ -31,12 +31,17 @@ class Normals:
     def rms(self) -> Array:
         return np.sqrt(self.residual_ss / np.maximum(self.pixels, 1))
 
+    @property
+    def rigid(self) -> Array:
+        """The block of the view's own motion. [views, 6, 6]"""
+        return self.hessian[:, :6, :6]
+
     def explained(self) -> Array:
         """Share of each view's residual variance that a rigid motion of the view explains (the paper's
         directional bias at edges, as one number). A view without misalignment has 6 / pixels. [views]"""
-        ridge = 1e-9 * np.trace(self.hessian, axis1=1, axis2=2)[:, None, None] * np.eye(6) / 6
-        step = np.linalg.solve(self.hessian + ridge + 1e-30 * np.eye(6), self.gradient[..., None])[..., 0]
-        return np.einsum("vi,vi->v", step, self.gradient) / np.maximum(self.weighted_ss, 1e-30)
+        ridge = 1e-9 * np.trace(self.rigid, axis1=1, axis2=2)[:, None, None] * np.eye(6) / 6
+        step = np.linalg.solve(self.rigid + ridge + 1e-30 * np.eye(6), self.gradient[:, :6, None])[..., 0]
+        return np.einsum("vi,vi->v", step, self.gradient[:, :6]) / np.maximum(self.weighted_ss, 1e-30)
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,7 @@ class Prior:
 
     rotation: float  # rad
     translation: float  # mm
+    strain: float = 0.01  # of the object, in one sweep
 
     def precision(self) -> Array:
         return np.array([1 / self.rotation**2] * 3 + [1 / self.translation**2] * 3)
@@ -55,7 +61,7 @@ def accumulate(
 ) -> Normals:
     """The normal equations of all views."""
     views = len(frames)
-    hessian, gradient, sums = np.zeros((views, 6, 6)), np.zeros((views, 6)), np.zeros((views, 4))
+    hessian, gradient, sums = np.zeros((views, 12, 12)), np.zeros((views, 12)), np.zeros((views, 4))
     packed = frames.packed()
     for k in range(views):
         sums[k] = renderer.motion_normal(
@@ -64,27 +70,42 @@ def accumulate(
     return Normals(hessian, gradient, *sums.T)
 
 
-def step_full(normals: Normals, motions: RigidMotions, prior: Prior, limit: Array, gain: float) -> RigidMotions:
-    """New poses after one damped Gauss-Newton step of every view.
+def step_full(
+    normals: Normals, motions: RigidMotions, prior: Prior, limit: Array
+) -> tuple[RigidMotions, Array]:
+    """New poses after one damped Gauss-Newton step, and the strain [3, 3] that the object's means must follow.
 
-    limit [6]: no component of a step exceeds it (rad, mm); the whole step is shortened instead.
-    gain over-relaxes: the volume has partly absorbed each view's misalignment, so steps fall short.
+    Views and strain are solved jointly (Schur complement of the arrow-shaped system): a stretched object seen
+    from slightly wrong angles and distances is nearly the same scan, and alternation alone takes hundreds of
+    sweeps to find its way along that valley.
+    limit [6]: no component of a view's step exceeds it (rad, mm); the whole step is shortened instead.
     """
     noise = np.maximum(normals.weighted_ss / np.maximum(normals.pixels - 6, 1), 1e-20)
     precision = prior.precision()
-    omega, tau = motions.vectors()
-    offset = np.concatenate([omega, tau], axis=1)
-    hessian = normals.hessian / noise[:, None, None] + np.diag(precision)
-    hessian += 1e-3 * hessian * np.eye(6)
-    gradient = normals.gradient / noise[:, None] + precision * offset
-    step = -gain * np.linalg.solve(hessian, gradient[..., None])[..., 0]
+    offset = np.concatenate(motions.vectors(), axis=1)
+    hessian = normals.hessian / noise[:, None, None]
+    gradient = normals.gradient / noise[:, None]
+    views = hessian[:, :6, :6] + np.diag(precision)
+    views += 1e-3 * views * np.eye(6)
+    pull = gradient[:, :6] + precision * offset
+    mixed = hessian[:, :6, 6:]
+    solved = np.linalg.solve(views, np.concatenate([pull[..., None], mixed], axis=2))
+    schur = hessian[:, 6:, 6:].sum(axis=0) - np.einsum("vij,vik->jk", mixed, solved[..., 1:])
+    schur += 1e-3 * np.diag(np.diag(schur)) + np.eye(6) / prior.strain**2
+    right = gradient[:, 6:].sum(axis=0) - np.einsum("vij,vi->j", mixed, solved[..., 0])
+    strain = np.clip(-np.linalg.solve(schur, right), -0.01, 0.01)
+    step = -solved[..., 0] - solved[..., 1:] @ strain
     step /= np.maximum(1.0, np.abs(step / limit).max(axis=1))[:, None]
-    return motions @ RigidMotions.exp(step[:, :3], step[:, 3:])
+    xx, yy, zz, yz, xz, xy = strain
+    return (
+        motions @ RigidMotions.exp(step[:, :3], step[:, 3:]),
+        np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
+    )
 
 
 def sigmas(normals: Normals, prior: Prior) -> tuple[Array, Array]:
     """One standard deviation of rotation [views, 3] rad and translation [views, 3] mm, the volume taken as known."""
     noise = np.maximum(normals.weighted_ss / np.maximum(normals.pixels - 6, 1), 1e-20)
-    precision = normals.hessian / noise[:, None, None] + np.diag(prior.precision())
+    precision = normals.rigid / noise[:, None, None] + np.diag(prior.precision())
     deviation = np.sqrt(np.diagonal(np.linalg.inv(precision), axis1=1, axis2=2))
     return deviation[:, :3], deviation[:, 3:]

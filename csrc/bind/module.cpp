@@ -159,8 +159,8 @@ void bind(nb::module_& m, const char* renderer_name) {
       .def(
           "motion_normal",
           [](R& self, Frame frame, bool cone, Rows3<T> means, Rows3<T> scales, Rows4<T> quats, In1<T> density,
-             In2<T> target, MaybeImage<T> mask, double huber_delta, nb::ndarray<double, nb::shape<6, 6>, nb::c_contig, nb::device::cpu> hessian,
-             Motion gradient) {
+             In2<T> target, MaybeImage<T> mask, double huber_delta, nb::ndarray<double, nb::shape<12, 12>, nb::c_contig, nb::device::cpu> hessian,
+             nb::ndarray<double, nb::shape<12>, nb::c_contig, nb::device::cpu> gradient) {
             const auto splats = splats_in<T>(means, scales, quats, density);
             require(huber_delta > 0, "huber_delta must be positive");
             const T *want = self.image(target), *on = self.maybe(mask);
@@ -170,8 +170,8 @@ void bind(nb::module_& m, const char* renderer_name) {
               nb::gil_scoped_release release;
               n = (*self).motion_normal(f, splats, want, on, huber_delta);
             }
-            for (int i = 0; i < 36; ++i) hessian.data()[i] = n.hessian[i];
-            for (int i = 0; i < 6; ++i) gradient.data()[i] = n.gradient[i];
+            for (int i = 0; i < 144; ++i) hessian.data()[i] = n.hessian[i];
+            for (int i = 0; i < 12; ++i) gradient.data()[i] = n.gradient[i];
             return nb::make_tuple(n.weighted_ss, n.residual_ss, n.residual_abs, n.pixels);
           },
           "frame"_a.noconvert(), "cone"_a, "means"_a.noconvert(), "scales"_a.noconvert(), "quats"_a.noconvert(),

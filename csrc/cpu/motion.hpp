@@ -1,7 +1,7 @@
-// Gauss-Newton sums of one view's rigid motion, band by band.
+// Gauss-Newton sums of one view, band by band.
 //
-// A band of detector rows and its six derivative images live in a scratch of a few hundred kilobytes
-// that stays in cache; the 6x6 sums are taken and the band is forgotten.
+// A band of detector rows and its twelve derivative images live in a scratch of a few hundred kilobytes
+// that stays in cache; the 12x12 sums are taken and the band is forgotten.
 #pragma once
 
 #include "cpu/renderer.hpp"
@@ -9,20 +9,23 @@
 namespace splat {
 inline namespace SPLAT_NS {
 
-// Draws value and six derivatives: 2^(..) times a quadratic in (dx, dy) for each parameter.
+inline constexpr int kPairs = kDirections * (kDirections + 1) / 2;
+inline constexpr int kSums = kPairs + kDirections + 4;
+
+// Draws value and derivatives: 2^(..) times a quadratic in (dx, dy) for each direction.
 template <class T>
 struct AddMotion {
   using P = typename PackLanes<T>::Value;
-  T* images;       // [7] of rows x stride, row `top` first
+  T* images;       // [1 + kDirections] of rows x stride, row `top` first
   long stride, plane;
   int top;
   P amplitude;
-  const T* c;      // [36]
+  const T* c;      // [kMotion]
   SPLAT_HD void operator()(int x, int y, P dx, T dy, P e) {
     T* at = images + (y - top) * stride + x;
     const P value = amplitude * e;
     (P::load(at) + value).store(at);
-    for (int k = 0; k < 6; ++k) {
+    for (int k = 0; k < kDirections; ++k) {
       const T* q = c + 6 * k;
       const P d = P(q[0] + dy * (q[2] + dy * q[5])) + dx * (P(q[1] + dy * q[4]) + dx * P(q[3]));
       T* to = at + (k + 1) * plane;
@@ -34,10 +37,10 @@ struct AddMotion {
 // Sums one row of a band: weights w = slope(r) / r of the Huber loss, times the mask.
 template <class T>
 inline void add_normal_row(const T* images, long plane, const T* target, const T* mask, int cols, T delta,
-                           double* sums /* 21 + 6 + 4 */) {
+                           double* sums /* [kSums] */) {
   using P = typename PackLanes<T>::Value;
   constexpr int N = PackLanes<T>::width;
-  P acc[31];
+  P acc[kSums];
   for (P& a : acc) a = P(T(0));
   for (int x = 0; x < cols; x += N) {
     T want[N], weight[N], on[N];
@@ -50,20 +53,20 @@ inline void add_normal_row(const T* images, long plane, const T* target, const T
       on[i] = w;
     }
     const P w = P::load(weight), m = P::load(on), r = P::load(images + x) - P::load(want);
-    P d[6];
+    P d[kDirections];
     int at = 0;
-    for (int k = 0; k < 6; ++k) {
+    for (int k = 0; k < kDirections; ++k) {
       d[k] = P::load(images + (k + 1) * plane + x);
       const P wd = w * d[k];
       for (int l = 0; l <= k; ++l) acc[at++] += wd * d[l];
-      acc[21 + k] += wd * r;
+      acc[kPairs + k] += wd * r;
     }
-    acc[27] += w * r * r;
-    acc[28] += m * r * r;
-    acc[29] += m * max_of(r, -r);
-    acc[30] += m;
+    acc[kPairs + kDirections + 0] += w * r * r;
+    acc[kPairs + kDirections + 1] += m * r * r;
+    acc[kPairs + kDirections + 2] += m * max_of(r, -r);
+    acc[kPairs + kDirections + 3] += m;
   }
-  for (int k = 0; k < 31; ++k)
+  for (int k = 0; k < kSums; ++k)
     for (int i = 0; i < N; ++i) sums[k] += acc[k].v[i];
 }
 
@@ -75,22 +78,22 @@ MotionNormal CpuRenderer<T>::motion_normal(const FrameIn& frame, const SplatsIn<
   const Stamp<T>* stamps = stamps_.data();
   const T* coefficients = motion_.data();
   const long plane = static_cast<long>(kBand) * stride_;
-  double* partial = partial_.reserve(static_cast<size_t>(bands_) * 31);
+  double* partial = partial_.reserve(static_cast<size_t>(bands_) * kSums);
 #pragma omp parallel num_threads(threads_)
   {
     Buffer<T> scratch;
-    T* images = scratch.reserve(7 * plane);
+    T* images = scratch.reserve((1 + kDirections) * plane);
 #pragma omp for schedule(dynamic, 1)
     for (int b = 0; b < bands_; ++b) {
       const int top = b * kBand, bottom = top + kBand < rows_ ? top + kBand : rows_;
-      memset(images, 0, 7 * plane * sizeof(T));
+      memset(images, 0, (1 + kDirections) * plane * sizeof(T));
       for (int64_t i = band_start_[b]; i < band_start_[b + 1]; ++i) {
         const int32_t n = band_order_[i];
         AddMotion<T> add{images, stride_, plane, top, P(stamps[n].amplitude), coefficients + static_cast<size_t>(n) * kMotion};
         walk<L>(stamps[n], top, bottom, add);
       }
-      double* sums = partial + static_cast<size_t>(b) * 31;
-      for (int k = 0; k < 31; ++k) sums[k] = 0;
+      double* sums = partial + static_cast<size_t>(b) * kSums;
+      for (int k = 0; k < kSums; ++k) sums[k] = 0;
       for (int y = top; y < bottom; ++y) {
         const size_t at = static_cast<size_t>(y) * cols_;
         add_normal_row(images + (y - top) * stride_, plane, target + at, mask ? mask + at : nullptr, cols_,
@@ -98,17 +101,17 @@ MotionNormal CpuRenderer<T>::motion_normal(const FrameIn& frame, const SplatsIn<
       }
     }
   }
-  double sums[31] = {};
+  double sums[kSums] = {};
   for (int b = 0; b < bands_; ++b)
-    for (int k = 0; k < 31; ++k) sums[k] += partial[static_cast<size_t>(b) * 31 + k];
+    for (int k = 0; k < kSums; ++k) sums[k] += partial[static_cast<size_t>(b) * kSums + k];
   MotionNormal normal;
-  for (int k = 0, at = 0; k < 6; ++k)
-    for (int l = 0; l <= k; ++l) normal.hessian[6 * k + l] = normal.hessian[6 * l + k] = sums[at++];
-  for (int k = 0; k < 6; ++k) normal.gradient[k] = sums[21 + k];
-  normal.weighted_ss = sums[27];
-  normal.residual_ss = sums[28];
-  normal.residual_abs = sums[29];
-  normal.pixels = sums[30];
+  for (int k = 0, at = 0; k < kDirections; ++k)
+    for (int l = 0; l <= k; ++l) normal.hessian[kDirections * k + l] = normal.hessian[kDirections * l + k] = sums[at++];
+  for (int k = 0; k < kDirections; ++k) normal.gradient[k] = sums[kPairs + k];
+  normal.weighted_ss = sums[kPairs + kDirections + 0];
+  normal.residual_ss = sums[kPairs + kDirections + 1];
+  normal.residual_abs = sums[kPairs + kDirections + 2];
+  normal.pixels = sums[kPairs + kDirections + 3];
   return normal;
 }
 

@@ -16,7 +16,7 @@ inline namespace SPLAT_NS {
 
 inline constexpr int kBand = 16;     // rows a band
 inline constexpr int kChunk = 512;   // splats a chunk; a multiple of every pack's size
-inline constexpr int kMotion = 36;   // six parameters, six polynomial coefficients
+inline constexpr int kMotion = 6 * kDirections;  // six polynomial coefficients for each direction
 
 template <class T>
 class CpuRenderer final : public Renderer<T> {
@@ -79,7 +79,7 @@ class CpuRenderer final : public Renderer<T> {
           stamps[first + i] = make_stamp(f, p.inverse_depth.v[i], rows_, cols_);
         }
         if (!motion) continue;
-        for (int k = 0; k < 6; ++k) {
+        for (int k = 0; k < kDirections; ++k) {
           const Moments<P> d = motion_derivative(view, g, p, k);
           for (int i = 0; i < n; ++i) {
             T* c = coefficients + (first + i) * kMotion + 6 * k;

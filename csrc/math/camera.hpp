@@ -150,15 +150,28 @@ SPLAT_HD GaussianGradient<T> project_vjp(const View<T>& view, const Gaussian<T>&
   return v;
 }
 
-// d(footprint value)/d(motion parameter) = value * (one + x dx + y dy + xx dx^2 + xy dx dy + yy dy^2).
-// Parameters 0..2: omega (rotation vector, rad), 3..5: tau (mm), of x -> x + omega x x + tau.
+// The directions in which the normal equations of a view are taken.
+inline constexpr int kRigid = 6;      // 0..2 omega (rotation vector, rad), 3..5 tau (mm) of x -> x + omega x x + tau
+inline constexpr int kDirections = 12;  // 6..11 strain xx, yy, zz, yz, xz, xy of the means, x -> x + E x
+
 template <class T>
-SPLAT_HD Moments<T> motion_derivative(const View<T>& view, const Gaussian<T>& g, const Projected<T>& p, int parameter) {
+SPLAT_HD Vec3<T> mean_velocity(const Vec3<T>& mean, int direction) {
   const T zero(0), one(1);
-  const int axis = parameter % 3;
+  const int axis = direction % 3;
   const Vec3<T> unit{axis == 0 ? one : zero, axis == 1 ? one : zero, axis == 2 ? one : zero};
-  const bool turn = parameter < 3;
-  const Vec3<T> d_mean = turn ? cross(unit, g.mean) : unit;
+  if (direction < 3) return cross(unit, mean);
+  if (direction < 6) return unit;
+  if (direction < 9) return {unit.x * mean.x, unit.y * mean.y, unit.z * mean.z};
+  return {unit.z * mean.y + unit.y * mean.z, unit.z * mean.x + unit.x * mean.z, unit.y * mean.x + unit.x * mean.y};
+}
+
+// d(footprint value)/d(direction) = value * (one + x dx + y dy + xx dx^2 + xy dx dy + yy dy^2).
+template <class T>
+SPLAT_HD Moments<T> motion_derivative(const View<T>& view, const Gaussian<T>& g, const Projected<T>& p, int direction) {
+  const T zero(0), one(1);
+  const Vec3<T> unit{direction == 0 ? one : zero, direction == 1 ? one : zero, direction == 2 ? one : zero};
+  const bool turn = direction < 3;
+  const Vec3<T> d_mean = mean_velocity(g.mean, direction);
   const T d_column = dot(p.j0, d_mean), d_row = dot(p.j1, d_mean);
   Vec3<T> d_j0{zero, zero, zero}, d_j1{zero, zero, zero};
   T d_log(0);  // of det J
