@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from typing import cast
 
 from redis import Redis
 from redis.backoff import NoBackoff
@@ -13,6 +14,7 @@ from redis.retry import Retry
 from rq import Queue, Worker
 from rq.job import Job as QueuedJob
 from rq.serializers import JSONSerializer
+from rq.utils import utcparse
 
 from worker.contract import QUEUE, TASK, queue_id
 from worker.ledger import Job
@@ -70,14 +72,22 @@ class Dispatcher:
             return False
 
     def live_workers(self) -> int:
-        """Workers seen lately; 0 when Redis cannot tell."""
+        """Workers seen lately; 0 when Redis cannot tell.
+
+        Counted by their heartbeats: RQ's list of workers is not restored when Redis was wiped.
+        """
+        now, live = datetime.now(UTC), 0
         try:
-            workers = Worker.all(queue=self._queue, serializer=JSONSerializer)
-        except RedisError:
+            for key in self._redis.scan_iter(f"{Worker.redis_worker_namespace_prefix}*", count=1000, _type="hash"):
+                fields = self._redis.hmget(key, "queues", "last_heartbeat", "death")
+                queues, seen, death = cast(list[bytes | None], fields)
+                ours = queues is None or QUEUE in queues.decode().split(",")
+                if not ours or seen is None or death is not None:
+                    continue
+                live += (now - utcparse(seen.decode())).total_seconds() < WORKER_SILENCE_S
+        except (RedisError, ValueError):
             return 0
-        now = datetime.now(UTC)
-        seen = [worker.last_heartbeat for worker in workers if worker.last_heartbeat is not None]
-        return sum((now - moment.replace(tzinfo=UTC)).total_seconds() < WORKER_SILENCE_S for moment in seen)
+        return live
 
     def close(self) -> None:
         self._redis.close()

@@ -81,7 +81,7 @@ async def _on_invalid(_request: Request, error: Exception) -> JSONResponse:
 
 async def _on_bug(request: Request, error: Exception) -> JSONResponse:
     log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return response(500, "internal-error", "The server failed; its log says more.")
+    return response(500, "internal-server-error", "The server failed; its log says more.")
 
 
 def _pointer(where: Sequence[str | int]) -> str:

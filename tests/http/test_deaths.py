@@ -66,6 +66,7 @@ def test_a_stopped_worker_hands_its_job_back(stack: Stack) -> None:
     assert time.monotonic() - started < 10
     job = stack.job(job_id)
     assert (job["state"], job["attempt"]) == ("queued", 2) and not stack.engine_pids()
+    assert stack.http.get("/readyz").json()["workers"] == 0
 
 
 def test_wiping_redis_loses_no_queued_job(stack: Stack) -> None:
@@ -104,6 +105,16 @@ def test_jobs_are_accepted_without_redis_and_run_when_it_is_back(stack: Stack) -
     stack.redis.start()
     stack.start_worker()
     assert stack.wait(job_id, "succeeded", "failed")["state"] == "succeeded"
+
+
+@pytest.mark.slow
+def test_a_worker_is_seen_again_after_redis_was_wiped(stack: Stack) -> None:
+    stack.start_worker()
+    stack.until(lambda: stack.http.get("/readyz").status_code == 200, what="a worker")
+    with Redis.from_url(stack.redis.url) as redis:
+        redis.flushall()
+    assert stack.http.get("/readyz").status_code == 503
+    stack.until(lambda: stack.http.get("/readyz").status_code == 200, 30, "the worker again")
 
 
 @pytest.mark.slow

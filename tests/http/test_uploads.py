@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 from uuid import uuid4
 
@@ -212,3 +213,17 @@ def test_a_scan_is_kept_while_a_job_needs_it(stack: Stack) -> None:
     assert stack.http.delete(f"/v1/scans/{scan_id}").status_code == 204
     answer = stack.http.post("/v1/jobs", json={"scan_id": scan_id})
     assert answer.status_code == 422
+
+
+def test_commits_at_the_same_time_give_one_scan(http: httpx.Client, shared: Stack) -> None:
+    upload_id = send(http, scan_files())
+
+    def commit_once(_: int) -> httpx.Response:
+        return httpx.post(f"{http.base_url}/v1/uploads/{upload_id}/commit", trust_env=False, timeout=30)
+
+    with ThreadPoolExecutor(4) as pool:
+        answers = list(pool.map(commit_once, range(4)))
+    assert [answer.status_code for answer in answers] == [201] * 4
+    assert len({answer.text for answer in answers}) == 1
+    listed = [scan["id"] for scan in http.get("/v1/scans").json()["scans"]]
+    assert listed.count(upload_id) == 1
