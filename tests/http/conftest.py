@@ -15,9 +15,9 @@ def stack(tmp_path: Path) -> Iterator[Stack]:
         yield running
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
-    """A service that the tests of one module share, with one worker."""
+    """A service that the tests which break nothing share, with one worker."""
     with Stack(tmp_path_factory.mktemp("stack")) as running:
         running.start_worker()
         yield running

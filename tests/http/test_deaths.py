@@ -13,7 +13,7 @@ from redis import Redis
 from .stack import Stack, commit, kill, scan_files, submit
 
 
-def long_job(stack: Stack, steps: int = 40) -> str:
+def long_job(stack: Stack, steps: int = 24) -> str:
     return submit(stack.http, commit(stack.http, scan_files(steps=steps, pause=0.05)))
 
 
@@ -42,7 +42,7 @@ def test_a_killed_worker_takes_its_engine_along_and_the_job_runs_again_once(stac
     events = stack.http.get(f"/v1/jobs/{job_id}/events").json()["events"]
     assert sorted({event.get("attempt", 2) for event in events}) == [1, 2]
     assert sum(event["stage"] == "read" for event in events) == 2
-    time.sleep(1.5)  # room for a second run, if there were one
+    time.sleep(1.0)  # room for a second run, if there were one
     assert publications(stack, job_id) == 1 and not stack.engine_pids()
 
 
@@ -87,7 +87,7 @@ def test_wiping_redis_loses_no_queued_job(stack: Stack) -> None:
 
 def test_wiping_redis_does_not_disturb_a_running_job(stack: Stack) -> None:
     stack.start_worker()
-    job_id = long_job(stack, steps=60)
+    job_id = long_job(stack, steps=36)
     mid_job(stack, job_id)
     with Redis.from_url(stack.redis.url) as redis:
         redis.flushall()
