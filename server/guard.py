@@ -7,6 +7,8 @@ marks as coming from another site.
 
 from __future__ import annotations
 
+import ipaddress
+
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -22,7 +24,6 @@ _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
     "object-src 'none'; base-uri 'none'; frame-ancestors 'none'; form-action 'self'",
 }
-_LOCAL_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]", "::1"})
 
 
 class Guard:
@@ -41,7 +42,7 @@ class Guard:
                     MutableHeaders(scope=message).setdefault(name, value)
             await send(message)
 
-        if _host_name(headers.get("host", "")) not in _LOCAL_NAMES:
+        if not _is_local(headers.get("host", "")):
             refusal = response(421, "misdirected-request", "This server answers to its loopback name only.")
         elif scope["method"] not in ("GET", "HEAD", "OPTIONS") and headers.get("sec-fetch-site") in (
             "cross-site",
@@ -82,6 +83,11 @@ def _limited(receive: Receive, limit: int) -> Receive:
     return counted
 
 
-def _host_name(host: str) -> str:
+def _is_local(host: str) -> bool:
+    """Whether a Host header names this machine by a loopback name."""
     name, colon, port = host.rpartition(":")
-    return (name if colon and port.isdecimal() else host).lower()
+    name = (name if colon and port.isdecimal() else host).strip("[]").lower()
+    try:
+        return name == "localhost" or ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False

@@ -126,3 +126,20 @@ def test_not_ready_without_a_worker(http: httpx.Client) -> None:
     assert answer.status_code == 503
     assert answer.json() == {"ready": False, "database": True, "redis": True, "disk": True, "workers": 0}
     assert http.get("/healthz").json() == {"status": "alive"}
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("localhost:8080", 200),
+        ("127.0.0.1", 200),
+        ("[::1]:8080", 200),
+        ("127.1.2.3:1", 200),
+        ("127.0.0.1.attacker.example", 421),
+        ("[::2]:8080", 421),
+        ("10.0.0.1:8080", 421),
+        ("", 421),
+    ],
+)
+def test_only_loopback_names_are_answered(http: httpx.Client, host: str, status: int) -> None:
+    assert http.get("/healthz", headers={"host": host}).status_code == status
