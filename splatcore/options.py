@@ -4,6 +4,7 @@ command line, the HTTP API and the worker. Standard library only: the server imp
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import math
 from dataclasses import dataclass, field
@@ -36,9 +37,7 @@ class Options:
     def __post_init__(self) -> None:
         for name, kind in (("calibrate", Calibrate), ("quality", Quality)):
             if getattr(self, name) not in get_args(kind):
-                raise OptionsError(
-                    f"{name}: got {getattr(self, name)!r}, expected one of {', '.join(get_args(kind))}"
-                )
+                raise OptionsError(f"{name}: got {getattr(self, name)!r}, expected one of {', '.join(get_args(kind))}")
         for knob in dataclasses.fields(self):
             value, low, high = getattr(self, knob.name), knob.metadata["low"], knob.metadata["high"]
             if low is None or value is None:
@@ -69,3 +68,16 @@ def describe() -> list[dict[str, Any]]:
         {"name": k.name, "default": k.default, "choices": choices.get(k.name), **k.metadata}
         for k in dataclasses.fields(Options)
     ]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Every knob as a command-line option; left out means its default."""
+    for knob in describe():
+        kind = str if knob["choices"] else (float if isinstance(knob["default"], float) else int)
+        parser.add_argument(f"--{knob['name']}", type=kind, choices=knob["choices"], help=knob["help"])
+
+
+def from_arguments(args: argparse.Namespace) -> Options:
+    """The options that `add_arguments` put into a parsed command line."""
+    given = {knob.name: getattr(args, knob.name) for knob in dataclasses.fields(Options)}
+    return Options.from_dict({name: value for name, value in given.items() if value is not None})

@@ -70,9 +70,7 @@ def accumulate(
     return Normals(hessian, gradient, *sums.T)
 
 
-def step_full(
-    normals: Normals, motions: RigidMotions, prior: Prior, limit: Array
-) -> tuple[RigidMotions, Array]:
+def step_full(normals: Normals, motions: RigidMotions, prior: Prior, limit: Array) -> tuple[RigidMotions, Array]:
     """New poses after one damped Gauss-Newton step, and the strain [3, 3] that the object's means must follow.
 
     Views and strain are solved jointly (Schur complement of the arrow-shaped system): a stretched object seen
@@ -101,6 +99,35 @@ def step_full(
         motions @ RigidMotions.exp(step[:, :3], step[:, 3:]),
         np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
     )
+
+
+def step_static(normals: Normals, frames: Frames, offset_mm: float, prior: Prior) -> float:
+    """The centre of rotation after one Gauss-Newton step: one shift of the object along u, shared by all
+    views, in mm at the isocentre (design: a detector offset in u is the same thing)."""
+    along = frames.u / np.linalg.norm(frames.u, axis=1, keepdims=True)
+    noise = np.maximum(normals.weighted_ss / np.maximum(normals.pixels - 6, 1), 1e-20)
+    curvature = np.einsum("vi,vij,vj->v", along, normals.hessian[:, 3:6, 3:6], along) / noise
+    slope = np.einsum("vi,vi->v", along, normals.gradient[:, 3:6]) / noise
+    precision = 1 / prior.translation**2
+    return offset_mm - float((slope.sum() + precision * offset_mm) / (curvature.sum() + precision))
+
+
+def static_motions(frames: Frames, offset_mm: float) -> RigidMotions:
+    """The object shifted along every view's own u."""
+    along = frames.u / np.linalg.norm(frames.u, axis=1, keepdims=True)
+    return RigidMotions(RigidMotions.identity(len(frames)).rotation, offset_mm * along)
+
+
+def split_static(frames: Frames, motions: RigidMotions) -> tuple[float, RigidMotions]:
+    """(the mean shift along u in mm, the motions without it): static and per-view parts share no direction."""
+    along = frames.u / np.linalg.norm(frames.u, axis=1, keepdims=True)
+    offset = float(np.einsum("vi,vi->v", along, motions.translation).mean())
+    return offset, RigidMotions(motions.rotation, motions.translation - offset * along)
+
+
+def axis_column(corrected: Frames) -> float:
+    """`cor_px`: the detector column on which the rotation axis falls at the isocentre's height, mean over views."""
+    return float(corrected.project(np.zeros((1, 3)))[:, 0, 0].mean())
 
 
 def sigmas(normals: Normals, prior: Prior) -> tuple[Array, Array]:

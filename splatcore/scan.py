@@ -57,6 +57,15 @@ def read_scan(folder: Path | str) -> Scan:
     )
 
 
+def read_header(folder: Path | str) -> ScanHeader:
+    """What scan.json says, without opening a TIFF. Raises ScanError with every problem found."""
+    doc = Document()
+    header = read_scan_json(Path(folder), doc)
+    _raise(doc)
+    assert header is not None
+    return header
+
+
 def check_scan(folder: Path | str, pixels: bool = True) -> ScanFacts:
     """The facts of a scan, one view in memory at a time; `pixels=False` stops at the TIFF headers.
 

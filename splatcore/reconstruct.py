@@ -1,0 +1,261 @@
+"""The joint reconstruction: splats and poses together, coarse to fine. Read this file first.
+
+At each resolution: backproject with the poses found so far (FDK), put splats where the volume is not empty,
+then alternate. One epoch of Adam on the splats, one view a step, for every sweep of Gauss-Newton over
+the poses. After each sweep the freedoms that no projection shows are settled, and the splats follow.
+
+    events = reconstruct(scan, options)      # a generator of Progress
+    for event in events: ...                 # its return value is the Reconstruction
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from splatcore.descent import Descent, Rates
+from splatcore.diagnose import diagnose
+from splatcore.errors import ReconstructionError
+from splatcore.gauge import settle
+from splatcore.geometry import Array, Frames, RigidMotions
+from splatcore.options import Options
+from splatcore.poses import (
+    Normals,
+    Prior,
+    accumulate,
+    axis_column,
+    sigmas,
+    split_static,
+    static_motions,
+    step_full,
+    step_static,
+)
+from splatcore.progress import Progress
+from splatcore.pyramid import Level, factors, level
+from splatcore.reconstruction import Reconstruction
+from splatcore.scan import Scan
+from splatcore.splats import Splats
+from splatcore.start import fdk, splats_from_volume
+
+# Adam steps at each binning factor. Coarse steps cost a hundredth of fine ones.
+_STEPS = {8: 600, 4: 750, 2: 1200, 1: 2400}
+_QUALITY = {"preview": 1.0, "normal": 1.0, "fine": 1.5}
+_FINEST = {"preview": 2, "normal": 1, "fine": 1}
+_SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
+_REACH_PX = 1.5  # longest pose step, in pixels of the level
+_HUBER = 2.0  # standard deviations of the residual beyond which a pixel counts less for the poses
+
+# The prior where the scanner states no tolerance: degrees, and a share of the volume's half width.
+_LOOSE_ROTATION_DEG, _LOOSE_TRANSLATION = 5.0, 0.1
+
+_GAUGE = (
+    "world settled where the poses are nearest nominal: mean rotation zero; translation and, for a cone beam, "
+    "magnification by least squares"
+)
+
+
+def drain(events: Generator[Progress, None, Reconstruction]) -> Reconstruction:
+    """Run a reconstruction to its end without looking at its events."""
+    while True:
+        try:
+            next(events)
+        except StopIteration as end:
+            result: Reconstruction = end.value
+            return result
+
+
+def reconstruct(scan: Scan, options: Options | None = None) -> Generator[Progress, None, Reconstruction]:
+    """Reconstruct a scan. Yields Progress, returns the Reconstruction.
+
+    Raises ReconstructionError where the projections hold nothing to reconstruct.
+    """
+    options = resolved(scan, options or Options())
+    run = _Run(scan, options)
+    yield run.progress("start", f"{len(scan.frames)} views of {scan.frames.rows} x {scan.frames.cols}")
+    scales = factors(scan, _FINEST[options.quality])
+    run.plan(scales)
+    for factor in scales:
+        yield from run.level(level(scan, factor))
+    return (yield from run.finish())
+
+
+def resolved(scan: Scan, options: Options) -> Options:
+    """Options with every default filled in: all the processor's threads, splats by the volume's size."""
+    threads = options.threads or len(os.sched_getaffinity(0))
+    edge = scan.volume.voxels ** (1 / 3)
+    splats = options.splats or int(np.clip(30_000 * (edge / 128) ** 1.5, 2_000, 2_000_000))
+    return replace(options, threads=threads, splats=splats)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What a level is expected to cost, in splat-steps."""
+
+    steps: int
+    splats: int
+
+    @property
+    def cost(self) -> float:
+        return self.steps * (self.splats + 500)
+
+
+class _Run:
+    """One reconstruction under way: the splats, the poses and the clock."""
+
+    def __init__(self, scan: Scan, options: Options) -> None:
+        self._scan, self._options = scan, options
+        assert options.threads is not None and options.splats is not None
+        self._threads, self._most_splats = options.threads, options.splats
+        self._rng = np.random.default_rng(options.seed)
+        self._began = time.monotonic()
+        self._timings: dict[str, float] = {}
+        half = float(scan.volume.half_extent_mm().max())
+        stated = scan.tolerance
+        rotation_deg = stated.rotation_deg if stated and stated.rotation_deg else _LOOSE_ROTATION_DEG
+        translation = stated.translation_mm if stated and stated.translation_mm else _LOOSE_TRANSLATION * half
+        self._prior = Prior(float(np.deg2rad(rotation_deg)), translation)
+        self._radius = half
+        self._offset = 0.0  # static shift along u, mm
+        self._motions = RigidMotions.identity(len(scan.frames))
+        self._splats: Splats | None = None
+        self._normals: Normals | None = None
+        self._deviation = 0.0  # robust residual, line-integral units, from the last sweep
+        self._works: dict[int, _Work] = {}
+        self._done = 0.0
+        self._fraction = 0.0
+
+    def plan(self, scales: list[int]) -> None:
+        """Steps and splats of each level: splats grow with the detail there is to see."""
+        for factor in scales:
+            steps = int(_STEPS[factor] * _QUALITY[self._options.quality])
+            splats = max(min(1_500, self._most_splats), int(self._most_splats / factor**1.5))
+            self._works[factor] = _Work(steps, splats)
+
+    def progress(self, stage: str, message: str, **facts: object) -> Progress:
+        return Progress(stage, self._fraction, message, time.monotonic() - self._began, **facts)  # type: ignore[arg-type]
+
+    def level(self, here: Level) -> Generator[Progress, None, None]:
+        """One resolution: from backprojection to refined splats and poses."""
+        began, work = time.monotonic(), self._works[here.factor]
+        frames = self._motions.correct(here.nominal)
+        volume = fdk(here.images, frames, here.grid, self._threads)
+        splats = splats_from_volume(volume, here.grid, work.splats, self._rng)
+        top = float(here.images.max())
+        descent = Descent(
+            splats, here.nominal.rows, here.nominal.cols, voxel_mm=here.voxel_mm,
+            density_unit=float(np.percentile(volume, 99.9)), steps=work.steps, rates=Rates(), huber=1e-4 * top,
+            dssim=self._options.dssim, data_range=top, threads=self._threads,
+        )  # fmt: skip
+        yield self.progress(
+            "level", f"binning {here.factor}: {len(splats)} splats", level=here.factor, splats=len(splats)
+        )
+        views, cone, loss = len(frames), frames.beam == "cone", 0.0
+        first_sweep = min(2 * views, int(_SETTLE_IN * work.steps))
+        packed = frames.packed()
+        order: list[int] = []
+        for step in range(1, work.steps + 1):
+            order = order or list(self._rng.permutation(views))
+            view = order.pop()
+            loss += descent.step(packed[view], cone, here.images[view], here.mask)
+            if order and step < work.steps:
+                continue
+            if not np.isfinite(loss):
+                raise ReconstructionError(
+                    f"the loss became {loss} at binning {here.factor}, step {step}; a bug, please report it"
+                )
+            self._advance(work, step)
+            moved: dict[str, float] = {}
+            if self._options.calibrate != "none" and step >= first_sweep:
+                moved = self._sweep(here, descent)
+                packed = self._motions.correct(here.nominal).packed()
+            yield self.progress(
+                "poses" if moved else "level", f"binning {here.factor}, step {step} of {work.steps}", level=here.factor,
+                step=step, loss=loss / (views - len(order)), splats=len(splats), **moved,
+            )  # fmt: skip
+            loss = 0.0
+        self._done += work.cost
+        self._splats = descent.splats
+        frames = self._motions.correct(here.nominal)
+        self._normals = accumulate(descent.renderer, descent.splats, frames, here.images, here.mask, self._huber(here))
+        self._timings[f"binning_{here.factor}"] = time.monotonic() - began
+
+    def _advance(self, work: _Work, step: int) -> None:
+        total = sum(w.cost for w in self._works.values())
+        self._fraction = 0.9 * (self._done + work.cost * step / work.steps) / total
+
+    def _huber(self, here: Level) -> float:
+        return _HUBER * self._deviation or float(np.abs(here.images).max())
+
+    def _sweep(self, here: Level, descent: Descent) -> dict[str, float]:
+        """One Gauss-Newton step of all poses; the splats follow the strain and the gauge. Returns how far poses moved."""
+        before = self._motions
+        normals = accumulate(
+            descent.renderer, descent.splats, before.correct(here.nominal), here.images, here.mask, self._huber(here)
+        )
+        self._deviation = 1.2533 * float(normals.residual_abs.sum() / max(normals.pixels.sum(), 1.0))
+        if self._options.calibrate == "static":
+            self._offset = step_static(normals, here.nominal, self._offset, self._prior)
+            self._motions = static_motions(here.nominal, self._offset)
+        else:
+            reach = _REACH_PX * here.pixel_at_isocentre_mm
+            limit = np.array([reach / self._radius] * 3 + [3 * reach] * 3)
+            motions, strain = step_full(normals, before, self._prior, limit)
+            similarity, self._motions = settle(here.nominal, motions)
+            stretched = (descent.splats.means @ (np.eye(3) + strain)).astype(np.float32)
+            descent.replace(replace(descent.splats, means=stretched).moved(similarity))
+        omega, tau = (self._motions @ before.inverse()).vectors()
+        return {
+            "moved_deg": float(np.rad2deg(np.sqrt((omega**2).sum(axis=1).mean()))),
+            "moved_mm": float(np.sqrt((tau**2).sum(axis=1).mean())),
+        }
+
+    def finish(self) -> Generator[Progress, None, Reconstruction]:
+        """Voxels, uncertainties and the report."""
+        assert self._splats is not None and self._normals is not None
+        scan, options, began = self._scan, self._options, time.monotonic()
+        corrected = self._motions.correct(scan.frames)
+        volume = self._splats.voxelize(scan.volume, self._threads)
+        self._timings["voxelize"] = time.monotonic() - began
+        yield self.progress("diagnose", "compare nominal and corrected geometry")
+        began = time.monotonic()
+        _, corrections = split_static(scan.frames, self._motions)
+        sigma_omega, sigma_tau = self._sigmas(corrected)
+        static = {"cor_px": axis_column(corrected)}
+        report = diagnose(
+            scan, options, corrected, corrections, static, self._normals, (sigma_omega, sigma_tau), self._threads
+        )
+        self._timings["diagnose"] = time.monotonic() - began
+        self._timings["total"] = time.monotonic() - self._began
+        self._fraction = 1.0
+        yield self.progress("done", report["verdict"])
+        return Reconstruction(
+            scan_name=scan.name,
+            splats=self._splats,
+            volume=volume,
+            grid=scan.volume,
+            nominal=scan.frames,
+            corrected=corrected,
+            corrections=corrections,
+            sigma_rotation_deg=np.rad2deg(sigma_omega),
+            sigma_translation_mm=sigma_tau,
+            residual_rms=self._normals.rms,
+            static=static,
+            gauge=_GAUGE if options.calibrate == "full" else "nominal world kept",
+            report=report,
+            options=options,
+            timings=self._timings,
+        )
+
+    def _sigmas(self, corrected: Frames) -> tuple[Array, Array]:
+        """Standard deviations of omega [views, 3] rad and tau [views, 3] mm; zero for what was not fitted."""
+        assert self._normals is not None
+        if self._options.calibrate != "full":
+            return np.zeros((len(corrected), 3)), np.zeros((len(corrected), 3))
+        omega, tau = sigmas(self._normals, self._prior)
+        if corrected.beam == "parallel":
+            tau = np.where(np.abs(self._scan.frames.source) > 0.5, np.inf, tau)
+        return omega, tau
