@@ -55,7 +55,9 @@ class Descent:
         self.splats = Splats(*(np.ascontiguousarray(a, np.float32).copy() for a in splats.arrays()))
         self._log_scales = np.log(self.splats.scales)
         relative = np.maximum(self.splats.density / self._unit, 1e-6)
-        self._raw: Floats = np.where(relative > 20, relative, np.log(np.expm1(np.minimum(relative, 20)))).astype(np.float32)
+        self._raw: Floats = np.where(relative > 20, relative, np.log(np.expm1(np.minimum(relative, 20)))).astype(
+            np.float32
+        )
 
     def step(self, frame: Array, cone: bool, target: Floats, mask: Floats | None) -> float:
         """One Adam step on one view. Returns the loss before it."""

@@ -38,7 +38,7 @@ class Trial:
 
 def try_frames(here: Level, frames: Frames, held_out: Array, seed: int, threads: int) -> Trial:
     """A short reconstruction with fixed frames from the views that are not held out, and its residuals."""
-    kept = np.flatnonzero(~held_out)
+    kept = np.flatnonzero(np.logical_not(held_out))
     rng = np.random.default_rng(seed)
     volume = fdk(here.images[kept], frames[kept], here.grid, threads)
     splats = splats_from_volume(volume, here.grid, _SPLATS, rng)

@@ -19,9 +19,9 @@ from splatcore.grid import VolumeGrid
 from splatcore.machine import threads_allowed
 from splatcore.results import read_results
 from splatcore.scan import read_header
+from splatcore.scanfiles import find_file
 from splatcore.scangeometry import read_frames
 from splatcore.scanjson import ScanHeader
-from splatcore.scanfiles import find_file
 from splatcore.scores import psnr, ssim
 from splatcore.splats import Floats
 from splatcore.tiff import read_stack
@@ -38,12 +38,13 @@ def evaluate(results: Path | str, truth: Path | str, threads: int | None = None)
     """
     found = read_results(results)
     header, volume, unit, frames = _truth(Path(truth))
-    if volume.shape != found.volume.shape:
-        raise ScanError([Problem("/simulation/volume_file", f"the true volume is {volume.shape}, the result {found.volume.shape}",
-                                 "evaluate against the scan that was reconstructed")])  # fmt: skip
-    if len(frames) != len(found.frames):
-        raise ScanError([Problem("/simulation/frames", f"{len(frames)} true views, the result has {len(found.frames)}",
-                                 "evaluate against the scan that was reconstructed")])  # fmt: skip
+    for what, true, ours in (
+        ("volume_file", volume.shape, found.volume.shape),
+        ("frames", len(frames), len(found.frames)),
+    ):
+        if true != ours:
+            hint = "evaluate against the scan that was reconstructed"
+            raise ScanError([Problem(f"/simulation/{what}", f"the truth has {true}, the result {ours}", hint)])
     similarity, aligned = align(frames, found.frames)
     moved = found.splats.moved(similarity).voxelize(found.grid, threads or threads_allowed())
     scores: dict[str, Any] = {

@@ -36,7 +36,7 @@ def settle(nominal: Frames, motions: RigidMotions) -> tuple[Similarity, RigidMot
     shift = solution[:3]
     scale = 1.0 + float(solution[3]) if nominal.beam == "cone" else 1.0
     translation = target + np.einsum("vij,j->vi", matrix, solution)
-    return Similarity(turn, shift, scale), RigidMotions(rotation, translation)
+    return Similarity(turn, np.asarray(shift, np.float64), scale), RigidMotions(rotation, translation)
 
 
 def mean_rotation(rotations: Array) -> Array:

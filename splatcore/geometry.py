@@ -58,9 +58,7 @@ class Frames:
         shift_c = (cols * factor - self.cols) / 2
         shift_r = (rows * factor - self.rows) / 2
         center = self.detector_center + shift_c * self.u + shift_r * self.v
-        return replace(
-            self, detector_center=center, u=self.u * factor, v=self.v * factor, rows=rows, cols=cols
-        )
+        return replace(self, detector_center=center, u=self.u * factor, v=self.v * factor, rows=rows, cols=cols)
 
     def axes(self) -> Array:
         """Orthonormal detector axes as rows: along u, along v made square to u, their cross product. [views, 3, 3]"""

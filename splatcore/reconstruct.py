@@ -191,7 +191,7 @@ class _Run:
         return _HUBER * self._deviation or float(np.abs(here.images).max())
 
     def _sweep(self, here: Level, descent: Descent) -> dict[str, float]:
-        """One Gauss-Newton step of all poses; the splats follow the strain and the gauge. Returns how far poses moved."""
+        """One Gauss-Newton step of all poses; the splats follow strain and gauge. Returns how far poses moved."""
         before = self._motions
         normals = accumulate(
             descent.renderer, descent.splats, before.correct(here.nominal), here.images, here.mask, self._huber(here)
