@@ -44,7 +44,7 @@ class Footprints:
     center: Tensor  # [n, 2] column, row
     covariance: Tensor  # [n, 2, 2] px^2
     amplitude: Tensor  # [n] line integral through the centre
-    visible: Tensor  # [n] before the source
+    visible: Tensor  # [n] before the source as a whole, to 4 standard deviations
 
     def squared_distance(self, rows: int, cols: int) -> Tensor:
         """dx' S^-1 dx at every pixel. [n, r, c]"""
@@ -79,9 +79,11 @@ def footprints(
         return torch.stack([q[0], q[1], (x - origin) @ first / first.norm()])  # [3]
 
     means, axes = moved(means, rotations(quats), motion)  # [n, 3], [n, 3, 3]
-    visible = (means - origin) @ to_pixels[2] > 0 if cone else torch.ones(len(means), dtype=torch.bool)  # [n]
-    means = torch.where(visible[:, None], means, center)  # [n, 3]: a harmless place for the others
     covariance = axes @ torch.diag_embed(scales**2) @ axes.mT  # [n, 3, 3] mm^2
+    depth = (means - origin) @ to_pixels[2]  # [n]: share of the way from source to detector
+    spread = torch.einsum("i,nij,j->n", to_pixels[2], covariance, to_pixels[2]).sqrt()  # [n]: its standard deviation
+    visible = depth > 4 * spread if cone else torch.ones(len(means), dtype=torch.bool)  # [n]
+    means = torch.where(visible[:, None], means, center)  # [n, 3]: a harmless place for the others
     jacobian = vmap(jacrev(phi))(means)  # [n, 3, 3] px/mm and mm/mm
     ray_space = jacobian @ covariance @ jacobian.mT  # [n, 3, 3]
     flat = ray_space[:, :2, :2]  # [n, 2, 2] px^2

@@ -76,7 +76,7 @@ class CpuRenderer final : public Renderer<T> {
         for (int i = 0; i < n; ++i) {
           const Footprint<T> f{p.foot.column.v[i], p.foot.row.v[i], p.foot.a.v[i], p.foot.b.v[i], p.foot.c.v[i],
                                p.foot.amplitude.v[i]};
-          stamps[first + i] = make_stamp(f, p.inverse_depth.v[i], rows_, cols_);
+          stamps[first + i] = make_stamp(f, p.clearance.v[i], rows_, cols_);
         }
         if (!motion) continue;
         for (int k = 0; k < kDirections; ++k) {

@@ -22,9 +22,10 @@ struct Stamp {
 
 inline constexpr double kLog2E = 1.4426950408889634;
 
-// Never NaN: a Gaussian behind the source, outside the image or without mass gives an empty stamp.
+// Never NaN: a Gaussian that does not lie before the source as a whole (clearance, see Projected), outside the
+// image or without mass gives an empty stamp.
 template <class T>
-SPLAT_HD Stamp<T> make_stamp(const Footprint<T>& f, T inverse_depth, int rows, int cols) {
+SPLAT_HD Stamp<T> make_stamp(const Footprint<T>& f, T clearance, int rows, int cols) {
   Stamp<T> s;
   s.column = f.column;
   s.row = f.row;
@@ -34,7 +35,7 @@ SPLAT_HD Stamp<T> make_stamp(const Footprint<T>& f, T inverse_depth, int rows, i
   s.y0 = 0;
   s.y1 = -1;
   const T det = f.a * f.c - f.b * f.b;
-  const bool finite = inverse_depth > T(0) && f.amplitude != T(0) && det > T(0) && f.amplitude * T(0) == T(0);
+  const bool finite = clearance > T(0) && f.amplitude != T(0) && det > T(0) && f.amplitude * T(0) == T(0);
   if (!finite) return s;
   const T scale(-0.5 * kLog2E);
   s.a = scale * f.a;

@@ -40,8 +40,9 @@ struct Projected {
   Vec3<T> j0, j1;        // gradients of column and row, px/mm
   T column_rel, row_rel; // before the detector's centre is added
   T inverse_depth;       // 1/q2
-  T t0[3], t1[3];        // T = J2 M
-  T cov_cc, cov_cr, cov_rr;  // S
+  T clearance;           // q2 less four standard deviations of it; below 0 the Gaussian reaches the source's plane
+  Vec3<T> t0, t1;        // rows of T = J2 M, px
+  Vec3<T> w0, w1;        // rows of W = S^-1 T, 1/px
   T per_density;         // amplitude / density
   Footprint<T> foot;
 };
@@ -67,22 +68,23 @@ SPLAT_HD Projected<T> project(const View<T>& view, const Gaussian<T>& g) {
     p.j1 = view.k1;
   }
   p.axes = axes_of(g.quat);
-  for (int k = 0; k < 3; ++k) {
-    p.half_axis[k] = g.scale[k] * p.axes.column[k];
-    p.t0[k] = dot(p.j0, p.half_axis[k]);
-    p.t1[k] = dot(p.j1, p.half_axis[k]);
+  for (int k = 0; k < 3; ++k) p.half_axis[k] = g.scale[k] * p.axes.column[k];
+  p.clearance = T(1);
+  if (view.cone) {
+    const Vec3<T> spread{dot(view.k2, p.half_axis[0]), dot(view.k2, p.half_axis[1]), dot(view.k2, p.half_axis[2])};
+    p.clearance = dot(view.k2, p.offset) - T(4) * sqrt_of(dot(spread, spread));
   }
-  const Vec3<T> t0{p.t0[0], p.t0[1], p.t0[2]}, t1{p.t1[0], p.t1[1], p.t1[2]};
-  const Vec3<T> normal = cross(t0, t1);
-  const T det = dot(normal, normal), inverse_det = T(1) / det;
-  p.cov_cc = dot(t0, t0);
-  p.cov_cr = dot(t0, t1);
-  p.cov_rr = dot(t1, t1);
+  p.t0 = {dot(p.j0, p.half_axis[0]), dot(p.j0, p.half_axis[1]), dot(p.j0, p.half_axis[2])};
+  p.t1 = {dot(p.j1, p.half_axis[0]), dot(p.j1, p.half_axis[1]), dot(p.j1, p.half_axis[2])};
+  const Vec3<T> normal = cross(p.t0, p.t1);
+  const T inverse_det = T(1) / dot(normal, normal);
+  p.w0 = inverse_det * cross(p.t1, normal);
+  p.w1 = inverse_det * cross(normal, p.t0);
   p.foot.column = p.column_rel + view.column0;
   p.foot.row = p.row_rel + view.row0;
-  p.foot.a = p.cov_rr * inverse_det;
-  p.foot.b = -p.cov_cr * inverse_det;
-  p.foot.c = p.cov_cc * inverse_det;
+  p.foot.a = dot(p.t1, p.t1) * inverse_det;
+  p.foot.b = -dot(p.t0, p.t1) * inverse_det;
+  p.foot.c = dot(p.t0, p.t0) * inverse_det;
   const T sqrt_two_pi(2.5066282746310002);
   p.per_density = sqrt_two_pi * det_j * g.scale[0] * g.scale[1] * g.scale[2] * sqrt_of(inverse_det);
   p.foot.amplitude = g.density * p.per_density;
@@ -115,23 +117,20 @@ SPLAT_HD GaussianGradient<T> project_vjp(const View<T>& view, const Gaussian<T>&
   const T v_column = amplitude * (f.a * m.x + f.b * m.y);
   const T v_row = amplitude * (f.b * m.x + f.c * m.y);
   v.density = m.one * p.per_density;
-  // dL/dS = amplitude (Q M2 Q - one Q) / 2: the shape of the footprint, and the amplitude's 1/sqrt(det S).
-  const T half(0.5);
-  const T n00 = m.xx * f.a + m.xy * f.b, n01 = m.xx * f.b + m.xy * f.c;
-  const T n10 = m.xy * f.a + m.yy * f.b, n11 = m.xy * f.b + m.yy * f.c;
-  const T s00 = half * amplitude * (f.a * n00 + f.b * n10 - m.one * f.a);
-  const T s01 = half * amplitude * (f.a * n01 + f.b * n11 - m.one * f.b);
-  const T s11 = half * amplitude * (f.b * n01 + f.c * n11 - m.one * f.c);
-  const T two(2), along = m.one * amplitude;  // along = amplitude dL/damplitude = dL/d(ln amplitude)
+  // With Q = S^-1 and M2 the second moments: dL/dS = amplitude (Q M2 Q - one Q) / 2, of which the first term is the
+  // footprint's shape and the second the amplitude's 1/sqrt(det S); so dL/dT = 2 dL/dS T = amplitude (Q M2 - one) W.
+  const T along = m.one * amplitude;  // amplitude dL/damplitude = dL/d(ln amplitude)
+  const T h00 = amplitude * (f.a * m.xx + f.b * m.xy) - along, h01 = amplitude * (f.a * m.xy + f.b * m.yy);
+  const T h10 = amplitude * (f.b * m.xx + f.c * m.xy), h11 = amplitude * (f.b * m.xy + f.c * m.yy) - along;
+  const Vec3<T> v_t0 = h00 * p.w0 + h01 * p.w1, v_t1 = h10 * p.w0 + h11 * p.w1;
+  const T to0[3] = {v_t0.x, v_t0.y, v_t0.z}, to1[3] = {v_t1.x, v_t1.y, v_t1.z};
   Vec3<T> v_j0{T(0), T(0), T(0)}, v_j1{T(0), T(0), T(0)};
   Axes<T> v_axes;
   v.torque = {T(0), T(0), T(0)};
   for (int k = 0; k < 3; ++k) {
-    const T v_t0 = two * (s00 * p.t0[k] + s01 * p.t1[k]);
-    const T v_t1 = two * (s01 * p.t0[k] + s11 * p.t1[k]);
-    v_j0 = v_j0 + v_t0 * p.half_axis[k];
-    v_j1 = v_j1 + v_t1 * p.half_axis[k];
-    const Vec3<T> v_half = v_t0 * p.j0 + v_t1 * p.j1;
+    v_j0 = v_j0 + to0[k] * p.half_axis[k];
+    v_j1 = v_j1 + to1[k] * p.half_axis[k];
+    const Vec3<T> v_half = to0[k] * p.j0 + to1[k] * p.j1;
     v.scale[k] = dot(v_half, p.axes.column[k]) + along / g.scale[k];
     v_axes.column[k] = g.scale[k] * v_half;
     v.torque = v.torque + cross(p.half_axis[k], v_half);
@@ -181,30 +180,22 @@ SPLAT_HD Moments<T> motion_derivative(const View<T>& view, const Gaussian<T>& g,
     d_j1 = -d_depth * p.j1 - (d_row * p.inverse_depth) * view.k2;
     d_log = dot(p.offset, d_mean) / dot(p.offset, p.offset) - T(3) * d_depth;
   }
-  T d_cc(0), d_cr(0), d_rr(0);
-  for (int k = 0; k < 3; ++k) {
-    T d_t0 = dot(d_j0, p.half_axis[k]), d_t1 = dot(d_j1, p.half_axis[k]);
-    if (turn) {
-      const Vec3<T> d_half = cross(unit, p.half_axis[k]);
-      d_t0 += dot(p.j0, d_half);
-      d_t1 += dot(p.j1, d_half);
-    }
-    d_cc += T(2) * p.t0[k] * d_t0;
-    d_rr += T(2) * p.t1[k] * d_t1;
-    d_cr += p.t0[k] * d_t1 + p.t1[k] * d_t0;
-  }
-  // dQ = -Q dS Q, and d ln amplitude = d ln det J - tr(Q dS) / 2
+  Vec3<T> d_half[3] = {{zero, zero, zero}, {zero, zero, zero}, {zero, zero, zero}};
+  for (int k = 0; turn && k < 3; ++k) d_half[k] = cross(unit, p.half_axis[k]);
+  Vec3<T> d_t0{dot(d_j0, p.half_axis[0]) + dot(p.j0, d_half[0]), dot(d_j0, p.half_axis[1]) + dot(p.j0, d_half[1]),
+               dot(d_j0, p.half_axis[2]) + dot(p.j0, d_half[2])};
+  Vec3<T> d_t1{dot(d_j1, p.half_axis[0]) + dot(p.j1, d_half[0]), dot(d_j1, p.half_axis[1]) + dot(p.j1, d_half[1]),
+               dot(d_j1, p.half_axis[2]) + dot(p.j1, d_half[2])};
+  // With Y = dT W': dS = dT T' + T dT', dQ = -Q dS Q = -(Q Y + (Q Y)'), d ln amplitude = d ln det J - tr Y.
+  const T y00 = dot(d_t0, p.w0), y01 = dot(d_t0, p.w1), y10 = dot(d_t1, p.w0), y11 = dot(d_t1, p.w1);
   const Footprint<T>& f = p.foot;
-  const T n00 = d_cc * f.a + d_cr * f.b, n01 = d_cc * f.b + d_cr * f.c;
-  const T n10 = d_cr * f.a + d_rr * f.b, n11 = d_cr * f.b + d_rr * f.c;
-  const T half(0.5);
   Moments<T> d;
-  d.one = d_log - half * (n00 + n11);
+  d.one = d_log - (y00 + y11);
   d.x = f.a * d_column + f.b * d_row;
   d.y = f.b * d_column + f.c * d_row;
-  d.xx = half * (f.a * n00 + f.b * n10);
-  d.xy = f.a * n01 + f.b * n11;
-  d.yy = half * (f.b * n01 + f.c * n11);
+  d.xx = f.a * y00 + f.b * y10;
+  d.xy = f.a * y01 + f.b * (y00 + y11) + f.c * y10;
+  d.yy = f.b * y01 + f.c * y11;
   return d;
 }
 
