@@ -17,6 +17,8 @@ class SettingsError(SplatCTError):
 class Settings(WorkerSettings):
     host: str = "127.0.0.1"
     port: int = 8080
+    # A promise by whoever runs us in a container: its port is published on the host's loopback address alone.
+    published_on_loopback: bool = False
     check: str = "splatcore.check"  # for tests: the module that judges an uploaded scan
     check_memory_mib: int = 8192  # address space of that check; a hostile TIFF gets no further
     disk_floor_mib: int = 512  # kept free: no upload may take the last of the disk
@@ -24,11 +26,16 @@ class Settings(WorkerSettings):
     reconcile_s: float = 2.0
 
     def require_loopback(self) -> None:
-        """Refuse an address others could reach: there are no keys yet, so whoever connects may do all."""
+        """Refuse an address others could reach: there are no keys yet, so whoever connects may do all.
+
+        A container has no loopback of its host's to listen on. There, with `published_on_loopback`, all
+        addresses of the container will do; requests must still name a loopback host (see guard.py).
+        """
         if self.host == "localhost":
             return
         try:
-            safe = ipaddress.ip_address(self.host).is_loopback
+            address = ipaddress.ip_address(self.host)
+            safe = address.is_loopback or (self.published_on_loopback and address.is_unspecified)
         except ValueError:
             safe = False
         if not safe:

@@ -27,7 +27,7 @@ class _FromJson:
             raise UnexpectedAnswer(f"the server's {cls.__name__} is incomplete: {error}") from None
 
     def to_json(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)  # type: ignore[call-overload, no-any-return]
+        return dataclasses.asdict(self)  # type: ignore[call-overload]
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,16 @@ def test_only_loopback_is_served(host: str) -> None:
         Settings(host=host).require_loopback()
 
 
+@pytest.mark.parametrize(("host", "served"), [("0.0.0.0", True), ("::", True), ("192.168.1.5", False), ("", False)])
+def test_a_container_published_on_loopback_may_listen_on_all_its_addresses(host: str, served: bool) -> None:
+    settings = Settings(host=host, published_on_loopback=True)
+    if served:
+        settings.require_loopback()
+    else:
+        with pytest.raises(SettingsError, match="no authentication"):
+            settings.require_loopback()
+
+
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost", "127.1.2.3"])
 def test_loopback_names(host: str) -> None:
     Settings(host=host).require_loopback()
