@@ -47,6 +47,7 @@ _QUALITY = {"preview": 1.0, "normal": 1.0, "fine": 1.5}
 _FINEST = {"preview": 2, "normal": 1, "fine": 1}
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
 _REACH_PX = 1.5  # longest pose step, in pixels of the level
+_WORTH_THREADS = 4_000  # splats
 _HUBER = 2.0  # standard deviations of the residual beyond which a pixel counts less for the poses
 
 # The prior where the scanner states no tolerance: degrees, and a share of the volume's half width.
@@ -145,10 +146,12 @@ class _Run:
         volume = fdk(here.images, frames, here.grid, self._threads)
         splats = splats_from_volume(volume, here.grid, work.splats, self._rng)
         top = float(here.images.max())
+        # A level this small is done before a second thread is awake.
+        threads = self._threads if len(splats) >= _WORTH_THREADS else 1
         descent = Descent(
             splats, here.nominal.rows, here.nominal.cols, voxel_mm=here.voxel_mm,
             density_unit=float(np.percentile(volume, 99.9)), steps=work.steps, rates=Rates(), huber=1e-4 * top,
-            dssim=self._options.dssim, data_range=top, threads=self._threads,
+            dssim=self._options.dssim, data_range=top, threads=threads,
         )  # fmt: skip
         yield self.progress(
             "level", f"binning {here.factor}: {len(splats)} splats", level=here.factor, splats=len(splats)
