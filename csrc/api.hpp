@@ -62,7 +62,8 @@ class Renderer {
                           double* v_motion) = 0;
   // (1 - dssim) mean huber(I - target) + dssim (1 - mean SSIM) / 2, and its gradient; huber(r) is
   // r^2 / (2 delta) up to |r| = delta, |r| - delta / 2 beyond.
-  // mask [rows, cols] weights the pixels, may be null. data_range scales SSIM's constants. Returns the loss.
+  // mask [rows, cols], may be null: weights the pixels of the first term, multiplies image and target of the
+  // second. data_range scales SSIM's constants. Returns the loss.
   virtual double loss_vjp(const FrameIn&, const SplatsIn<T>&, const T* target, const T* mask, double huber_delta,
                           double dssim, double data_range, const SplatsOut<T>& v) = 0;
   // Gauss-Newton sums of a view, without ever holding a whole derivative image.

@@ -30,10 +30,13 @@ def rotations(quats: Tensor) -> Tensor:
 
 def moved(means: Tensor, axes: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
     """The object after x -> Exp(omega) x + tau. motion [6]: omega rad, tau mm."""
-    omega = motion[:3]  # [3]
-    angle = omega.norm()  # []
-    half = 0.5 * torch.sinc(angle / (2 * torch.pi)) * omega  # [3]: sin(angle / 2) times the axis
-    turn = rotations(torch.cat([torch.cos(angle / 2)[None], half])[None])[0]  # [3, 3]
+    x, y, z = motion[:3]  # 3 x []
+    zero = torch.zeros_like(x)  # []
+    w = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)  # [3, 3]: the matrix of omega x (.)
+    turn = term = torch.eye(3, dtype=w.dtype)  # [3, 3]
+    for k in range(1, 40):  # exp(w), smooth at zero; to the last digits up to half a turn
+        term = term @ w / k  # [3, 3]
+        turn = turn + term  # [3, 3]
     return means @ turn.T + motion[3:], turn @ axes  # [n, 3], [n, 3, 3]
 
 

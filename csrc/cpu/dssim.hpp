@@ -6,69 +6,101 @@
 namespace splat {
 inline namespace SPLAT_NS {
 
-// Adds the gradient of weight * (1 - mean SSIM) / 2 to gradient_, returns the term. The reverse of a
-// convolution with a symmetric window is the convolution itself, so five maps go forward, three back.
+// Row y of M separable convolutions at once. down(at, tap, sums) adds tap times the M inputs at offset `at`;
+// across(x, results) takes the M outputs of columns x + lane. columns: [M, width + 2 radius], zero at both ends.
+template <int M, class T, class Down, class Across>
+inline void convolve_row(const SsimWindow<T>& w, int y, int rows, long stride, long width, T* columns, Down down,
+                         Across across) {
+  using P = typename PackLanes<T>::Value;
+  constexpr int r = kSsimRadius;
+  const long pitch = width + 2 * r;
+  const int from = y < r ? -y : -r, to = y + r < rows ? r : rows - 1 - y;
+  for (long x = 0; x < width; x += P::size) {
+    P sums[M];
+    for (P& s : sums) s = P(T(0));
+    for (int k = from; k <= to; ++k) down((y + k) * stride + x, P(w.tap[k + r]), sums);
+    for (int m = 0; m < M; ++m) sums[m].store(columns + m * pitch + r + x);
+  }
+  for (long x = 0; x < width; x += P::size) {
+    P results[M];
+    for (P& s : results) s = P(T(0));
+    for (int k = 0; k <= 2 * r; ++k)
+      for (int m = 0; m < M; ++m) results[m] += P(w.tap[k]) * P::load(columns + m * pitch + x + k);
+    across(x, results);
+  }
+}
+
+// Adds the gradient of weight * (1 - mean SSIM) / 2 to gradient_, returns the term. Image and target are both
+// multiplied by the mask first, so what a dead pixel holds does not matter. The reverse of a convolution with
+// a symmetric window is the convolution itself: five maps go forward (x, y, xx, yy, xy), three adjoints come back.
 template <class T>
-double CpuRenderer<T>::dssim_loss(const T* target, double weight, double data_range) {
+double CpuRenderer<T>::dssim_loss(const T* target, const T* mask, double weight, double data_range) {
   static const SsimWindow<T> window;
-  const size_t pixels = static_cast<size_t>(rows_) * cols_;
-  T* maps = maps_.reserve(8 * pixels);
-  T *xx = maps, *yy = maps + pixels, *xy = maps + 2 * pixels;                                  // products
-  T *v_mean = maps + 3 * pixels, *v_xx = maps + 4 * pixels, *v_xy = maps + 5 * pixels;         // adjoints
-  T* x_image = maps + 6 * pixels;
-  const T c1 = T(1e-4 * data_range * data_range), c2 = T(9e-4 * data_range * data_range);
-  const T scale = T(-0.5 * weight / static_cast<double>(pixels));
+  const long width = (cols_ + P::size - 1) / P::size * P::size, pitch = width + 2 * kSsimRadius;
+  const size_t pixels = static_cast<size_t>(rows_) * stride_;
+  T* maps = maps_.reserve(5 * pixels);
+  T *have = maps, *want = maps + pixels;  // masked, zero from column cols_ on
+  T *v_mean = maps + 2 * pixels, *v_xx = maps + 3 * pixels, *v_xy = maps + 4 * pixels;  // adjoints
+  const P c1(T(1e-4 * data_range * data_range)), c2(T(9e-4 * data_range * data_range));
+  const P scale(T(-0.5 * weight / (static_cast<double>(rows_) * cols_))), zero(T(0)), two(T(2)), end{T(cols_)};
 #pragma omp parallel for num_threads(threads_) schedule(static)
   for (int y = 0; y < rows_; ++y) {
-    const T* have = line(image_, y);
-    const size_t at = static_cast<size_t>(y) * cols_;
-    for (int x = 0; x < cols_; ++x) {
-      x_image[at + x] = have[x];
-      xx[at + x] = have[x] * have[x];
-      yy[at + x] = target[at + x] * target[at + x];
-      xy[at + x] = have[x] * target[at + x];
-    }
+    const T *image = line(image_, y), *aim = target + static_cast<size_t>(y) * cols_;
+    const T* on = mask ? mask + static_cast<size_t>(y) * cols_ : nullptr;
+    T *to = have + y * stride_, *other = want + y * stride_;
+    for (int x = 0; x < cols_; ++x) to[x] = on ? on[x] * image[x] : image[x];
+    for (int x = 0; x < cols_; ++x) other[x] = on ? on[x] * aim[x] : aim[x];
+    for (long x = cols_; x < width; ++x) to[x] = other[x] = T(0);
   }
   double* partial = partial_.reserve(rows_);
 #pragma omp parallel num_threads(threads_)
   {
     Buffer<T> scratch;
-    T* row = scratch.reserve(6 * (cols_ + 2 * kSsimRadius));
-    T *mx = row + cols_ + 2 * kSsimRadius, *my = mx + cols_, *exx = my + cols_, *eyy = exx + cols_, *exy = eyy + cols_;
+    T* columns = scratch.reserve(5 * pitch);
+    memset(columns, 0, 5 * pitch * sizeof(T));
 #pragma omp for schedule(static)
     for (int y = 0; y < rows_; ++y) {
-      convolve_row(window, x_image, rows_, cols_, cols_, y, row, mx);
-      convolve_row(window, target, rows_, cols_, cols_, y, row, my);
-      convolve_row(window, xx, rows_, cols_, cols_, y, row, exx);
-      convolve_row(window, yy, rows_, cols_, cols_, y, row, eyy);
-      convolve_row(window, xy, rows_, cols_, cols_, y, row, exy);
-      const size_t at = static_cast<size_t>(y) * cols_;
-      double sum = 0;
-      for (int x = 0; x < cols_; ++x) {
-        const T a1 = 2 * mx[x] * my[x] + c1, a2 = 2 * (exy[x] - mx[x] * my[x]) + c2;
-        const T b1 = mx[x] * mx[x] + my[x] * my[x] + c1;
-        const T b2 = exx[x] - mx[x] * mx[x] + eyy[x] - my[x] * my[x] + c2;
-        const T inverse = 1 / (b1 * b2), ssim = a1 * a2 * inverse;
-        v_xy[at + x] = scale * 2 * a1 * inverse;
-        v_xx[at + x] = -scale * ssim / b2;
-        v_mean[at + x] = scale * (2 * my[x] * (a2 - a1) * inverse + 2 * mx[x] * ssim * (1 / b2 - 1 / b1));
-        sum += ssim;
-      }
-      partial[y] = sum;
+      P sum(T(0));
+      auto down = [&](long at, P tap, P* s) {
+        const P a = P::load(have + at), b = P::load(want + at), ta = tap * a, tb = tap * b;
+        s[0] += ta, s[1] += tb, s[2] += ta * a, s[3] += tb * b, s[4] += ta * b;
+      };
+      auto across = [&](long x, const P* m) {
+        const P mx = m[0], my = m[1], cross = mx * my, square = mx * mx + my * my;
+        const P a1 = two * cross + c1, a2 = two * (m[4] - cross) + c2;
+        const P b1 = square + c1, b2 = m[2] + m[3] - square + c2;
+        const P inverse = P(T(1)) / (b1 * b2), ssim = a1 * a2 * inverse;
+        const typename P::Mask inside = L::index() + P(T(x)) < end;
+        const long at = y * stride_ + x;
+        select(inside, scale * two * a1 * inverse, zero).store(v_xy + at);
+        select(inside, -scale * ssim * b1 * inverse, zero).store(v_xx + at);
+        select(inside, scale * two * inverse * (my * (a2 - a1) + mx * ssim * (b1 - b2)), zero).store(v_mean + at);
+        sum += select(inside, ssim, zero);
+      };
+      convolve_row<5>(window, y, rows_, stride_, width, columns, down, across);
+      partial[y] = L::sum(sum);
     }
 #pragma omp for schedule(static)
     for (int y = 0; y < rows_; ++y) {
-      convolve_row(window, v_mean, rows_, cols_, cols_, y, row, mx);
-      convolve_row(window, v_xx, rows_, cols_, cols_, y, row, exx);
-      convolve_row(window, v_xy, rows_, cols_, cols_, y, row, exy);
-      const T *have = line(image_, y), *want = target + static_cast<size_t>(y) * cols_;
       T* out = line(gradient_, y);
-      for (int x = 0; x < cols_; ++x) out[x] += mx[x] + 2 * have[x] * exx[x] + want[x] * exy[x];
+      auto down = [&](long at, P tap, P* s) {
+        s[0] += tap * P::load(v_mean + at), s[1] += tap * P::load(v_xx + at), s[2] += tap * P::load(v_xy + at);
+      };
+      auto across = [&](long x, const P* m) {
+        const long at = y * stride_ + x;
+        P v = m[0] + two * P::load(have + at) * m[1] + P::load(want + at) * m[2];
+        if (mask) {
+          const int n = cols_ - x < P::size ? static_cast<int>(cols_ - x) : P::size;
+          for (int i = 0; i < n; ++i) v.v[i] *= mask[static_cast<size_t>(y) * cols_ + x + i];
+        }
+        (P::load(out + x) + select(L::index() + P(T(x)) < end, v, zero)).store(out + x);
+      };
+      convolve_row<3>(window, y, rows_, stride_, width, columns, down, across);
     }
   }
   double total = 0;
   for (int y = 0; y < rows_; ++y) total += partial[y];
-  return weight * 0.5 * (1 - total / static_cast<double>(pixels));
+  return weight * 0.5 * (1 - total / (static_cast<double>(rows_) * cols_));
 }
 
 }  // namespace SPLAT_NS

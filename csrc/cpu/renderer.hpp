@@ -49,7 +49,7 @@ class CpuRenderer final : public Renderer<T> {
                   double dssim, double data_range, const SplatsOut<T>& v) override {
     draw(frame, splats);
     double loss = huber_loss(target, mask, T(huber_delta), 1 - dssim);
-    if (dssim > 0) loss += dssim_loss(target, dssim, data_range);
+    if (dssim > 0) loss += dssim_loss(target, mask, dssim, data_range);
     gather(frame, splats, v, nullptr);
     return loss;
   }
@@ -228,7 +228,7 @@ class CpuRenderer final : public Renderer<T> {
     return total * scale;
   }
 
-  double dssim_loss(const T* target, double weight, double data_range);
+  double dssim_loss(const T* target, const T* mask, double weight, double data_range);
 
   const int rows_, cols_, threads_;
   const long stride_;

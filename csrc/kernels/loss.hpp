@@ -1,4 +1,4 @@
-// Image losses and their gradients, one row at a time: Huber and D-SSIM.
+// Image losses: Huber with its slope, and the window of SSIM.
 #pragma once
 
 #include "platform.hpp"
@@ -27,26 +27,6 @@ struct SsimWindow {
     for (int i = 0; i <= 2 * kSsimRadius; ++i) tap[i] = T(w[i] / sum);
   }
 };
-
-// One output row of a separable convolution with zero padding. `in` is rows x stride;
-// `row` is scratch of cols + 2 radius.
-template <class T>
-void convolve_row(const SsimWindow<T>& w, const T* in, int rows, int cols, int stride, int y, T* row, T* out) {
-  const int r = kSsimRadius;
-  for (int x = 0; x < cols + 2 * r; ++x) row[x] = T(0);
-  for (int k = -r; k <= r; ++k) {
-    const int source = y + k;
-    if (source < 0 || source >= rows) continue;
-    const T* line = in + static_cast<long>(source) * stride;
-    const T tap = w.tap[k + r];
-    for (int x = 0; x < cols; ++x) row[x + r] += tap * line[x];
-  }
-  for (int x = 0; x < cols; ++x) {
-    T sum(0);
-    for (int k = 0; k <= 2 * r; ++k) sum += w.tap[k] * row[x + k];
-    out[x] = sum;
-  }
-}
 
 }  // namespace SPLAT_NS
 }  // namespace splat

@@ -115,9 +115,9 @@ def test_a_splat_that_shows_nowhere_is_nothing(isa: str) -> None:
 def test_arguments_are_checked_at_the_door() -> None:
     m, s, q, d = scenes.cloud().tensors()
     view = scenes.frame("cone")
-    with pytest.raises(ValueError, match="quats must be torch.float64 of shape"):
+    with pytest.raises(ValueError, match="quats must be torch"):
         ops.render(m, s, q[:, :3], d, NO_MOTION, view, True, ROWS, COLS)
-    with pytest.raises(ValueError, match="density must be torch.float64"):
+    with pytest.raises(ValueError, match="density must be torch"):
         ops.render(m, s, q, d.float(), NO_MOTION, view, True, ROWS, COLS)
     with pytest.raises(TypeError, match="float32 or float64"):
         ops.render(m.half(), s.half(), q.half(), d.half(), NO_MOTION, view, True, ROWS, COLS)
