@@ -7,7 +7,13 @@ each name loads its module on first use (PEP 562).
 from __future__ import annotations
 
 import importlib
+import os
 from typing import Any
+
+# How long an OpenMP thread of the core spins at a barrier before it sleeps. GNU's default, about a millisecond,
+# makes two threads on a busy machine slower than one, since they spin while others hold the processor.
+# Read when libgomp is loaded, so it is set before anything can load it.
+os.environ.setdefault("GOMP_SPINCOUNT", "5000")
 
 __version__ = "0.1.0"
 
