@@ -15,17 +15,6 @@ static Renderer<T>* make_renderer(int rows, int cols, int threads) {
   return new CpuRenderer<T>(rows, cols, threads);
 }
 
-template <class T>
-static void voxelize(const GridIn& grid, const SplatsIn<T>& splats, T* volume, int threads) {
-  VoxelGrid<T>(grid).voxelize(splats, volume, threads);
-}
-
-template <class T>
-static void voxelize_vjp(const GridIn& grid, const SplatsIn<T>& splats, const T* v_volume, const SplatsOut<T>& v,
-                         int threads) {
-  VoxelGrid<T>(grid).voxelize_vjp(splats, v_volume, v, threads);
-}
-
 // Twelve chains hide the latency of a fused multiply-add on two pipes of up to six cycles.
 template <class T>
 static double peak_fma(int64_t rounds, int threads) {

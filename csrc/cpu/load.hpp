@@ -1,8 +1,8 @@
-// Between the caller's arrays of records and packs of Gaussians or views.
+// Between the caller's arrays of records and packs of Gaussians.
 #pragma once
 
 #include "api.hpp"
-#include "math/camera.hpp"
+#include "math/view.hpp"
 
 namespace splat {
 inline namespace SPLAT_NS {
@@ -47,31 +47,13 @@ SPLAT_HD void store_pack(const SplatsOut<typename P::Scalar>& out, int64_t first
   }
 }
 
-// K = [u | v | center - source]^-1 (cone) or [u | v | ray]^-1 (parallel), in double.
-template <class S>
-inline View<S> make_view(const FrameIn& f, int rows, int cols) {
-  double third[3], length = 1;
-  for (int i = 0; i < 3; ++i) third[i] = f.cone ? f.center[i] - f.first[i] : f.first[i];
-  if (!f.cone) length = sqrt(third[0] * third[0] + third[1] * third[1] + third[2] * third[2]);
-  const Vec3<double> u{f.u[0], f.u[1], f.u[2]}, v{f.v[0], f.v[1], f.v[2]}, w{third[0], third[1], third[2]};
-  const double det = dot(cross(u, v), w), inverse = 1 / det;
-  const Vec3<double> k0 = inverse * cross(v, w), k1 = inverse * cross(w, u), k2 = inverse * cross(u, v);
-  const double* o = f.cone ? f.first : f.center;
-  auto to = [](const Vec3<double>& a) {
-    using T = typename S::Scalar;
-    return Vec3<S>{S(T(a.x)), S(T(a.y)), S(T(a.z))};
-  };
-  using T = typename S::Scalar;
-  View<S> view;
-  view.k0 = to(k0);
-  view.k1 = to(k1);
-  view.k2 = to(k2);
-  view.origin = to({o[0], o[1], o[2]});
-  view.column0 = S(T((cols - 1) / 2.0));
-  view.row0 = S(T((rows - 1) / 2.0));
-  view.det_k = S(T(fabs(inverse) * length));
-  view.cone = f.cone;
-  return view;
+// A Gaussian that shows nowhere may have NaN for derivatives (it may lie in the source's plane): they become zero.
+template <class P>
+SPLAT_HD void clear_lane(GaussianGradient<P>& d, int lane) {
+  P* all[] = {&d.mean.x, &d.mean.y, &d.mean.z, &d.torque.x, &d.torque.y, &d.torque.z, &d.density};
+  for (P* p : all) p->v[lane] = 0;
+  for (P& p : d.scale) p.v[lane] = 0;
+  for (P& p : d.quat) p.v[lane] = 0;
 }
 
 }  // namespace SPLAT_NS

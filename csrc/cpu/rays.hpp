@@ -141,12 +141,11 @@ void project_volume_adjoint(const FrameIn& f, const GridIn& g, const T* image, i
 template <class T>
 void backproject(const FrameIn& f, const GridIn& g, const T* image, int rows, int cols, double weight, T* volume,
                  int threads) {
-  using S = Pack<T, 1>;
-  const View<S> view = make_view<S>(f, rows, cols);
-  auto at = [](const Vec3<S>& k, double x, double y, double z) { return k.x.v[0] * x + k.y.v[0] * y + k.z.v[0] * z; };
+  const View<T> view = make_view<T>(f, rows, cols);
+  auto at = [](const Vec3<T>& k, double x, double y, double z) { return k.x * x + k.y * y + k.z * z; };
   const double iso = f.cone ? -at(view.k2, f.first[0], f.first[1], f.first[2]) : 1;
   const double* o = f.cone ? f.first : f.center;
-  const T du = T(view.k0.x.v[0] * g.voxel[2]), dv = T(view.k1.x.v[0] * g.voxel[2]), dw = T(view.k2.x.v[0] * g.voxel[2]);
+  const T du = T(view.k0.x * g.voxel[2]), dv = T(view.k1.x * g.voxel[2]), dw = T(view.k2.x * g.voxel[2]);
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
   for (int k = 0; k < g.nz; ++k) {
     for (int j = 0; j < g.ny; ++j) {
@@ -157,7 +156,7 @@ void backproject(const FrameIn& f, const GridIn& g, const T* image, int rows, in
       T* out = volume + (static_cast<long>(k) * g.ny + j) * g.nx;
       for (int i = 0; i < g.nx; ++i) {
         const T depth = f.cone ? w0 + T(i) * dw : T(1), inverse = T(1) / depth;
-        const T c = (u0 + T(i) * du) * inverse + view.column0.v[0], r = (v0 + T(i) * dv) * inverse + view.row0.v[0];
+        const T c = (u0 + T(i) * du) * inverse + view.column0, r = (v0 + T(i) * dv) * inverse + view.row0;
         if (!(c >= T(0) && r >= T(0) && c <= T(cols - 1) && r <= T(rows - 1) && depth > T(0))) continue;
         const int ic = static_cast<int>(c) < cols - 1 ? static_cast<int>(c) : (cols > 1 ? cols - 2 : 0);
         const int ir = static_cast<int>(r) < rows - 1 ? static_cast<int>(r) : (rows > 1 ? rows - 2 : 0);

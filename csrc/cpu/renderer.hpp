@@ -62,7 +62,7 @@ class CpuRenderer final : public Renderer<T> {
 
   // Projects all splats: stamps_, and with `motion` the polynomial coefficients of motion_derivative.
   void stamp(const FrameIn& frame, const SplatsIn<T>& splats, bool motion) {
-    const View<P> view = make_view<P>(frame, rows_, cols_);
+    const View<P> view = widen<P>(make_view<T>(frame, rows_, cols_));
     Stamp<T>* stamps = stamps_.reserve(splats.count);
     T* coefficients = motion ? motion_.reserve(splats.count * kMotion) : nullptr;
     const int64_t chunks = (splats.count + kChunk - 1) / kChunk;
@@ -141,7 +141,7 @@ class CpuRenderer final : public Renderer<T> {
 
   // From gradient_ (dL/dimage, zero in the padding) to dL/dsplats. Needs stamps_ of this frame.
   void gather(const FrameIn& frame, const SplatsIn<T>& splats, const SplatsOut<T>& v, double* v_motion) {
-    const View<P> view = make_view<P>(frame, rows_, cols_);
+    const View<P> view = widen<P>(make_view<T>(frame, rows_, cols_));
     const int64_t chunks = (splats.count + kChunk - 1) / kChunk;
     double* partial = v_motion ? partial_.reserve(chunks * 6) : nullptr;
 #pragma omp parallel for num_threads(threads_) schedule(dynamic, 1)
@@ -169,7 +169,8 @@ class CpuRenderer final : public Renderer<T> {
         }
         const Gaussian<P> g = load_pack<P>(splats, first);
         GaussianGradient<P> d = project_vjp(view, g, project(view, g), m);
-        drop_hidden(first, n, d);
+        for (int i = 0; i < n; ++i)
+          if (stamps_[first + i].x0 > stamps_[first + i].x1) clear_lane(d, i);
         store_pack<P>(v, first, end, d.mean, d.scale, d.quat, d.density);
         for (int i = 0; v_motion && i < n; ++i) {
           const T part[6] = {d.torque.x.v[i], d.torque.y.v[i], d.torque.z.v[i], d.mean.x.v[i], d.mean.y.v[i], d.mean.z.v[i]};
@@ -182,17 +183,6 @@ class CpuRenderer final : public Renderer<T> {
     for (int k = 0; k < 6; ++k) v_motion[k] = 0;
     for (int64_t chunk = 0; chunk < chunks; ++chunk)
       for (int k = 0; k < 6; ++k) v_motion[k] += partial[chunk * 6 + k];
-  }
-
-  // Lanes whose stamp is empty may hold NaN (a Gaussian in the source's plane): they get zero.
-  void drop_hidden(int64_t first, int n, GaussianGradient<P>& d) {
-    for (int i = 0; i < n; ++i) {
-      if (stamps_[first + i].x0 <= stamps_[first + i].x1) continue;
-      P* all[] = {&d.mean.x, &d.mean.y, &d.mean.z, &d.torque.x, &d.torque.y, &d.torque.z, &d.density};
-      for (P* p : all) p->v[i] = T(0);
-      for (int k = 0; k < 3; ++k) d.scale[k].v[i] = T(0);
-      for (int k = 0; k < 4; ++k) d.quat[k].v[i] = T(0);
-    }
   }
 
   // Overwrites gradient_ with the slope of the weighted Huber mean; returns the loss.

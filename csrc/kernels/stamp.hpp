@@ -35,7 +35,8 @@ SPLAT_HD Stamp<T> make_stamp(const Footprint<T>& f, T clearance, int rows, int c
   s.y0 = 0;
   s.y1 = -1;
   const T det = f.a * f.c - f.b * f.b;
-  const bool finite = clearance > T(0) && f.amplitude != T(0) && det > T(0) && f.amplitude * T(0) == T(0);
+  const bool finite =
+      clearance > T(0) && f.amplitude != T(0) && det > T(0) && (f.amplitude + f.column + f.row) * T(0) == T(0);
   if (!finite) return s;
   const T scale(-0.5 * kLog2E);
   s.a = scale * f.a;

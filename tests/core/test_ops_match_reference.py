@@ -95,9 +95,10 @@ def test_voxelize(isa: str, dtype: torch.dtype, scene: str) -> None:
     volume_twin(dtype, scene).compare(ops.voxelize(*leaves, GRID, *SHAPE), leaves)
 
 
-def test_a_splat_that_shows_nowhere_is_nothing(isa: str) -> None:
-    """Far off the detector, in the source's plane, without mass, or not a number: zero, and zero gradients."""
-    c = scenes.cloud(6)
+@pytest.mark.parametrize("what", ["cone", "parallel", "volume"])
+def test_a_splat_that_shows_nowhere_is_nothing(isa: str, what: str) -> None:
+    """Far away, in the source's plane, without mass, without size, or not a number: zero, and zero gradients."""
+    c = scenes.cloud(8)
     means, scales, density = c.means.clone(), c.scales.clone(), c.density.clone()
     means[0] += 1e4
     means[1] = scenes.frame("cone")[0]
@@ -105,10 +106,20 @@ def test_a_splat_that_shows_nowhere_is_nothing(isa: str) -> None:
     scales[3] = 0
     means[4, 1] = float("nan")
     density[5] = float("inf")
-    leaves = [*Cloud(means, scales, c.quats, density).leaves(), NO_MOTION.clone().requires_grad_()]
-    image = ops.render(*leaves, scenes.frame("cone"), True, ROWS, COLS)
-    assert torch.equal(image, torch.zeros(ROWS, COLS, dtype=torch.float64))
-    for gradient in torch.autograd.grad(image.sum(), leaves):
+    scales[6, 2] = float("nan")
+    means[7, 0] = float("inf")
+    leaves = Cloud(means, scales, c.quats, density).leaves()
+    if what == "volume":
+        seen = ops.voxelize(*leaves, GRID, *SHAPE)
+    else:
+        leaves.append(NO_MOTION.clone().requires_grad_())
+        # A parallel beam has no source whose plane could hold the second one.
+        beam: Beam = "cone" if what == "cone" else "parallel"
+        if beam == "parallel":
+            leaves[:4] = [t.detach()[[0, 2, 3, 4, 5, 6, 7]].requires_grad_() for t in leaves[:4]]
+        seen = ops.render(*leaves, scenes.frame(beam), beam == "cone", ROWS, COLS)
+    assert torch.equal(seen, torch.zeros_like(seen))
+    for gradient in torch.autograd.grad(seen.sum(), leaves):
         assert torch.equal(gradient, torch.zeros_like(gradient))
 
 

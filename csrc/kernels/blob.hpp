@@ -1,0 +1,165 @@
+// Blob: a Gaussian among voxels made ready to be walked, the walk, and its reverse; as stamp.hpp for pixels.
+#pragma once
+
+#include "api.hpp"
+#include "kernels/stamp.hpp"
+
+namespace splat {
+inline namespace SPLAT_NS {
+
+// Precision matrix A = R diag(1/s^2) R', six numbers.
+template <class T>
+struct Precision {
+  T xx, yy, zz, xy, xz, yz;
+};
+
+template <class T>
+SPLAT_HD Precision<T> precision_of(const Gaussian<T>& g, const Axes<T>& axes) {
+  Precision<T> a{T(0), T(0), T(0), T(0), T(0), T(0)};
+  for (int k = 0; k < 3; ++k) {
+    const Vec3<T> c = (T(1) / g.scale[k]) * axes.column[k];
+    a.xx += c.x * c.x, a.yy += c.y * c.y, a.zz += c.z * c.z;
+    a.xy += c.x * c.y, a.xz += c.x * c.z, a.yz += c.y * c.z;
+  }
+  return a;
+}
+
+// In voxel indices: the centre, the exponent in powers of two, the half extents of the ellipsoid.
+template <class T>
+struct BlobShape {
+  T i, j, k;                 // x, y, z
+  T ii, jj, kk, ij, ik, jk;  // 2^(ii di^2 + .. + jk dj dk)
+  T reach_i, reach_j, reach_k;
+};
+
+template <class T>
+SPLAT_HD BlobShape<T> blob_shape(const GridIn& grid, const Gaussian<T>& g) {
+  const Axes<T> axes = axes_of(g.quat);
+  const Precision<T> a = precision_of(g, axes);
+  const T vx(grid.voxel[2]), vy(grid.voxel[1]), vz(grid.voxel[0]), half(-0.5 * kLog2E), whole(-kLog2E);
+  BlobShape<T> b;
+  b.i = (g.mean.x - T(grid.center[0])) / vx + T((grid.nx - 1) / 2.0);
+  b.j = (g.mean.y - T(grid.center[1])) / vy + T((grid.ny - 1) / 2.0);
+  b.k = (g.mean.z - T(grid.center[2])) / vz + T((grid.nz - 1) / 2.0);
+  b.ii = half * a.xx * vx * vx, b.jj = half * a.yy * vy * vy, b.kk = half * a.zz * vz * vz;
+  b.ij = whole * a.xy * vx * vy, b.ik = whole * a.xz * vx * vz, b.jk = whole * a.yz * vy * vz;
+  // The ellipsoid's half extents: sqrt(cutoff) times the roots of the covariance's diagonal.
+  T x(0), y(0), z(0);
+  for (int k = 0; k < 3; ++k) {
+    const Vec3<T> h = g.scale[k] * axes.column[k];
+    x += h.x * h.x, y += h.y * h.y, z += h.z * h.z;
+  }
+  const T cutoff(kCutoff);
+  b.reach_i = sqrt_of(cutoff * x) / vx;
+  b.reach_j = sqrt_of(cutoff * y) / vy;
+  b.reach_k = sqrt_of(cutoff * z) / vz;
+  return b;
+}
+
+template <class T>
+struct Blob {
+  BlobShape<T> shape;
+  T density;
+  int i0, i1, j0, j1, k0, k1;  // inclusive bounds inside the volume; i0 > i1 where nothing shows
+};
+
+template <class T>
+SPLAT_HD void bound(T center, T reach, int n, int& low, int& high) {
+  const T left = max_of(center - reach, T(0)), right = min_of(center + reach, T(n - 1));
+  low = 0;
+  high = -1;
+  if (!(left <= right)) return;
+  low = static_cast<int>(ceil(left));
+  high = static_cast<int>(floor(right));
+}
+
+// Never NaN: a Gaussian outside the volume, without mass or not finite gives an empty blob.
+template <class T>
+SPLAT_HD Blob<T> make_blob(const GridIn& grid, const BlobShape<T>& s, T density) {
+  Blob<T> b;
+  b.shape = s;
+  b.density = density;
+  bound(s.i, s.reach_i, grid.nx, b.i0, b.i1);
+  bound(s.j, s.reach_j, grid.ny, b.j0, b.j1);
+  bound(s.k, s.reach_k, grid.nz, b.k0, b.k1);
+  const bool finite = s.ii < T(0) && s.jj < T(0) && s.kk < T(0) && density != T(0) &&
+                      (density + s.ii + s.jj + s.kk + s.i + s.j + s.k) * T(0) == T(0);
+  if (b.j0 > b.j1 || b.k0 > b.k1 || !finite) b.i1 = b.i0 - 1;
+  return b;
+}
+
+// Calls visit(row, i, dx, dy, dz, e) for every `width` voxels (row + i + lane) of the blob in slices [from, to):
+// e is the unit-density value, zero beyond the cutoff; dx, dy, dz count voxels.
+template <class L, class T, class Visit>
+SPLAT_HD void walk_blob(const GridIn& grid, const Blob<T>& b, int from, int to, Visit& visit) {
+  using V = typename L::Value;
+  const T limit(-0.5 * kLog2E * kCutoff);
+  const BlobShape<T>& s = b.shape;
+  const int k0 = b.k0 > from ? b.k0 : from, k1 = b.k1 < to - 1 ? b.k1 : to - 1;
+  for (int k = k0; k <= k1; ++k) {
+    const T dz = T(k) - s.k;
+    for (int j = b.j0; j <= b.j1; ++j) {
+      const T dy = T(j) - s.j;
+      const T flat = dz * (s.kk * dz + s.jk * dy) + s.jj * dy * dy, lean = s.ij * dy + s.ik * dz;
+      // The row's best value is flat - lean^2 / (4 ii); below the cutoff the row is skipped.
+      if (flat - lean * lean / (4 * s.ii) < limit) continue;
+      const long row = (static_cast<long>(k) * grid.ny + j) * grid.nx;
+      for (int i = b.i0; i <= b.i1; i += L::width) {
+        const V dx = L::index() + V(T(i) - s.i);
+        const V power = V(flat) + dx * (V(lean) + V(s.ii) * dx);
+        visit(row, i, dx, dy, dz, select(power > V(limit), exp2_of(power), V(T(0))));
+      }
+    }
+  }
+}
+
+// Sums of G e times 1, dx, dy, dz, and the six products of two of them, over a blob; G = dL/dvolume.
+template <class T>
+struct BlobMoments {
+  T one, x, y, z, xx, yy, zz, xy, xz, yz;
+};
+
+template <class L, class T, class Read>
+struct GatherBlob {
+  using V = typename L::Value;
+  Read read;  // read(row, i): the gradient at voxels row + i + lane, zero beyond the end of the row
+  BlobMoments<V> m{V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0))};
+  SPLAT_HD void operator()(long row, int i, V dx, T dy, T dz, V e) {
+    const V t = read(row, i) * e, tx = t * dx, ty = t * V(dy), tz = t * V(dz);
+    m.one += t, m.x += tx, m.y += ty, m.z += tz;
+    m.xx += tx * dx, m.yy += ty * V(dy), m.zz += tz * V(dz), m.xy += tx * V(dy), m.xz += tx * V(dz), m.yz += ty * V(dz);
+  }
+  // In mm.
+  SPLAT_HD BlobMoments<T> total(const GridIn& grid) const {
+    const T x(grid.voxel[2]), y(grid.voxel[1]), z(grid.voxel[0]);
+    return {L::sum(m.one),          x * L::sum(m.x),      y * L::sum(m.y),      z * L::sum(m.z),      x * x * L::sum(m.xx),
+            y * y * L::sum(m.yy), z * z * L::sum(m.zz), x * y * L::sum(m.xy), x * z * L::sum(m.xz), y * z * L::sum(m.yz)};
+  }
+};
+
+// From the moments to dL/d(Gaussian); `torque` is left at zero. value = density exp(-d'Ad/2): dL/dmean = density A m1,
+// dL/dA = -density M2 / 2, and with A = sum_k c_k c_k', c_k = column_k / s_k: dL/dc_k = -density M2 c_k.
+template <class T>
+SPLAT_HD GaussianGradient<T> blob_vjp(const Gaussian<T>& g, const BlobMoments<T>& m) {
+  const Axes<T> axes = axes_of(g.quat);
+  const Precision<T> a = precision_of(g, axes);
+  GaussianGradient<T> v;
+  v.torque = {T(0), T(0), T(0)};
+  v.density = m.one;
+  v.mean = g.density * Vec3<T>{a.xx * m.x + a.xy * m.y + a.xz * m.z, a.xy * m.x + a.yy * m.y + a.yz * m.z,
+                               a.xz * m.x + a.yz * m.y + a.zz * m.z};
+  Axes<T> v_axes;
+  for (int k = 0; k < 3; ++k) {
+    const T inverse = T(1) / g.scale[k];
+    const Vec3<T> c = inverse * axes.column[k];
+    const Vec3<T> v_c = -g.density * Vec3<T>{m.xx * c.x + m.xy * c.y + m.xz * c.z, m.xy * c.x + m.yy * c.y + m.yz * c.z,
+                                             m.xz * c.x + m.yz * c.y + m.zz * c.z};
+    v_axes.column[k] = inverse * v_c;
+    v.scale[k] = -inverse * dot(c, v_c);
+  }
+  axes_of_vjp(g.quat, axes, v_axes, v.quat);
+  return v;
+}
+
+}  // namespace SPLAT_NS
+}  // namespace splat
