@@ -78,6 +78,13 @@ class Frames:
         """The point that `pixel_from_world` measures from. [views, 3] mm"""
         return self.source if self.beam == "cone" else self.detector_center
 
+    def isocentre_depth(self) -> Array:
+        """The share of the way from source to detector plane at which the isocentre lies: what a pixel shrinks by
+        there. Ones for a parallel beam. [views]"""
+        if self.beam == "parallel":
+            return np.ones(len(self))
+        return np.abs(np.einsum("vi,vi->v", self.pixel_from_world()[:, 2], self.source))
+
     def project(self, points: Array) -> Array:
         """Points [n, 3] mm to (column, row) array indices. [views, n, 2]"""
         q = np.einsum("vij,vnj->vni", self.pixel_from_world(), points[None] - self.origin()[:, None])

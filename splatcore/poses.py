@@ -102,9 +102,9 @@ def step_full(normals: Normals, motions: RigidMotions, prior: Prior, limit: Arra
 
 
 def step_static(normals: Normals, frames: Frames, offset_mm: float, prior: Prior) -> float:
-    """The centre of rotation after one Gauss-Newton step: one shift of the object along u, shared by all
-    views, in mm at the isocentre (design: a detector offset in u is the same thing)."""
-    along = frames.u / np.linalg.norm(frames.u, axis=1, keepdims=True)
+    """The centre of rotation after one Gauss-Newton step: how far the axis lies from nominal along u, in mm at the
+    isocentre. All views share it; its derivative is that of the object shifted along u."""
+    along = _along_u(frames)
     noise = np.maximum(normals.weighted_ss / np.maximum(normals.pixels - 6, 1), 1e-20)
     curvature = np.einsum("vi,vij,vj->v", along, normals.hessian[:, 3:6, 3:6], along) / noise
     slope = np.einsum("vi,vi->v", along, normals.gradient[:, 3:6]) / noise
@@ -112,17 +112,22 @@ def step_static(normals: Normals, frames: Frames, offset_mm: float, prior: Prior
     return offset_mm - float((slope.sum() + precision * offset_mm) / (curvature.sum() + precision))
 
 
-def static_motions(frames: Frames, offset_mm: float) -> RigidMotions:
-    """The object shifted along every view's own u."""
-    along = frames.u / np.linalg.norm(frames.u, axis=1, keepdims=True)
-    return RigidMotions(RigidMotions.identity(len(frames)).rotation, offset_mm * along)
+def off_centre(frames: Frames, offset_mm: float) -> Frames:
+    """A scanner whose axis lies `offset_mm` from nominal along u: the detector moved the other way, by as much as
+    that is at the detector. Median magnification over views."""
+    width = np.linalg.norm(frames.u, axis=1) * frames.isocentre_depth()
+    return frames.shifted_detector(-offset_mm / float(np.median(width)))
 
 
 def split_static(frames: Frames, motions: RigidMotions) -> tuple[float, RigidMotions]:
     """(the mean shift along u in mm, the motions without it): static and per-view parts share no direction."""
-    along = frames.u / np.linalg.norm(frames.u, axis=1, keepdims=True)
+    along = _along_u(frames)
     offset = float(np.einsum("vi,vi->v", along, motions.translation).mean())
     return offset, RigidMotions(motions.rotation, motions.translation - offset * along)
+
+
+def _along_u(frames: Frames) -> Array:
+    return frames.u / np.linalg.norm(frames.u, axis=1, keepdims=True)
 
 
 def axis_column(corrected: Frames) -> float:

@@ -35,10 +35,7 @@ class Level:
     def pixel_at_isocentre_mm(self) -> float:
         """A detector pixel seen at the isocentre, the smaller of its sides, median over views."""
         step = np.minimum(np.linalg.norm(self.nominal.u, axis=1), np.linalg.norm(self.nominal.v, axis=1))
-        if self.nominal.beam == "cone":
-            depth = self.nominal.pixel_from_world()[:, 2]
-            step = step * np.abs(np.einsum("vi,vi->v", depth, self.nominal.source))
-        return float(np.median(step))
+        return float(np.median(step * self.nominal.isocentre_depth()))
 
     def views(self, chosen: np.ndarray) -> Level:
         """The level with these views only."""

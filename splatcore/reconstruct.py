@@ -28,9 +28,9 @@ from splatcore.poses import (
     Prior,
     accumulate,
     axis_column,
+    off_centre,
     sigmas,
     split_static,
-    static_motions,
     step_full,
     step_static,
 )
@@ -120,7 +120,7 @@ class _Run:
         translation = stated.translation_mm if stated and stated.translation_mm else _LOOSE_TRANSLATION * half
         self._prior = Prior(float(np.deg2rad(rotation_deg)), translation)
         self._radius = half
-        self._offset = 0.0  # static shift along u, mm
+        self._offset = 0.0  # of the rotation axis along u, mm at the isocentre
         self._motions = RigidMotions.identity(len(scan.frames))
         self._splats: Splats | None = None
         self._normals: Normals | None = None
@@ -142,7 +142,7 @@ class _Run:
     def level(self, here: Level) -> Generator[Progress, None, None]:
         """One resolution: from backprojection to refined splats and poses."""
         began, work = time.monotonic(), self._works[here.factor]
-        frames = self._motions.correct(here.nominal)
+        frames = self._corrected(here.nominal)
         volume = fdk(here.images, frames, here.grid, self._threads)
         splats = splats_from_volume(volume, here.grid, work.splats, self._rng)
         top = float(here.images.max())
@@ -174,7 +174,7 @@ class _Run:
             moved: dict[str, float] = {}
             if self._options.calibrate != "none" and step >= first_sweep:
                 moved = self._sweep(here, descent)
-                packed = self._motions.correct(here.nominal).packed()
+                packed = self._corrected(here.nominal).packed()
             yield self.progress(
                 "poses" if moved else "level", f"binning {here.factor}, step {step} of {work.steps}", level=here.factor,
                 step=step, loss=loss / (views - len(order)), splats=len(splats), **moved,
@@ -182,27 +182,29 @@ class _Run:
             loss = 0.0
         self._done += work.cost
         self._splats = descent.splats
-        frames = self._motions.correct(here.nominal)
-        self._normals = accumulate(descent.renderer, descent.splats, frames, here.images, here.mask, self._huber(here))
+        self._normals = self._accumulate(here, descent)
         self._timings[f"binning_{here.factor}"] = time.monotonic() - began
+
+    def _corrected(self, nominal: Frames) -> Frames:
+        """Static part first, then every view's own."""
+        return self._motions.correct(off_centre(nominal, self._offset))
+
+    def _accumulate(self, here: Level, descent: Descent) -> Normals:
+        frames = self._corrected(here.nominal)
+        huber = _HUBER * self._deviation or float(np.abs(here.images).max())
+        return accumulate(descent.renderer, descent.splats, frames, here.images, here.mask, huber)
 
     def _advance(self, work: _Work, step: int) -> None:
         total = sum(w.cost for w in self._works.values())
         self._fraction = 0.9 * (self._done + work.cost * step / work.steps) / total
 
-    def _huber(self, here: Level) -> float:
-        return _HUBER * self._deviation or float(np.abs(here.images).max())
-
     def _sweep(self, here: Level, descent: Descent) -> dict[str, float]:
         """One Gauss-Newton step of all poses; the splats follow strain and gauge. Returns how far poses moved."""
-        before = self._motions
-        normals = accumulate(
-            descent.renderer, descent.splats, before.correct(here.nominal), here.images, here.mask, self._huber(here)
-        )
+        before, offset = self._motions, self._offset
+        normals = self._accumulate(here, descent)
         self._deviation = 1.2533 * float(normals.residual_abs.sum() / max(normals.pixels.sum(), 1.0))
         if self._options.calibrate == "static":
             self._offset = step_static(normals, here.nominal, self._offset, self._prior)
-            self._motions = static_motions(here.nominal, self._offset)
         else:
             reach = _REACH_PX * here.pixel_at_isocentre_mm
             limit = np.array([reach / self._radius] * 3 + [3 * reach] * 3)
@@ -213,19 +215,20 @@ class _Run:
         omega, tau = (self._motions @ before.inverse()).vectors()
         return {
             "moved_deg": float(np.rad2deg(np.sqrt((omega**2).sum(axis=1).mean()))),
-            "moved_mm": float(np.sqrt((tau**2).sum(axis=1).mean())),
+            "moved_mm": float(np.hypot(np.sqrt((tau**2).sum(axis=1).mean()), self._offset - offset)),
         }
 
     def finish(self) -> Generator[Progress, None, Reconstruction]:
         """Voxels, uncertainties and the report."""
         assert self._splats is not None and self._normals is not None
         scan, options, began = self._scan, self._options, time.monotonic()
-        corrected = self._motions.correct(scan.frames)
+        corrected = self._corrected(scan.frames)
         volume = self._splats.voxelize(scan.volume, self._threads)
         self._timings["voxelize"] = time.monotonic() - began
+        # What all views share along u is the scanner's; as a motion of the object it shows in every frame.
+        _, corrections = split_static(scan.frames, self._motions)
         yield self.progress("diagnose", "compare nominal and corrected geometry")
         began = time.monotonic()
-        _, corrections = split_static(scan.frames, self._motions)
         sigma_omega, sigma_tau = self._sigmas(corrected)
         static = {"cor_px": axis_column(corrected)}
         report = diagnose(
