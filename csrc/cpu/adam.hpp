@@ -11,7 +11,8 @@ template <class T>
 struct AdamTerms {
   T keep1, keep2, correct1, correct2;
   explicit AdamTerms(int step)
-      : keep1(T(0.9)), keep2(T(0.999)), correct1(T(1 / (1 - pow(0.9, step)))), correct2(T(1 / (1 - pow(0.999, step)))) {}
+      : keep1(T(0.9)), keep2(T(0.999)), correct1(T(1 / (1 - pow(0.9, step)))),
+        correct2(T(1 / (1 - pow(0.999, step)))) {}
   // The change of a parameter of gradient g and moments m, v, per unit of learning rate.
   SPLAT_HD T move(T g, T& m, T& v) const {
     m = keep1 * m + (T(1) - keep1) * g;
@@ -24,7 +25,8 @@ template <class T>
 void adam(const AdamState<T>& s, const SplatsOut<T>& g, const AdamRates& r, int threads) {
   const AdamTerms<T> terms(r.step);
   const T low = T(log(r.scale_low)), high = T(log(r.scale_high));
-  const T mean = T(r.mean), log_scale = T(r.log_scale), quat = T(r.quat), density = T(r.density), unit = T(r.density_unit);
+  const T mean = T(r.mean), log_scale = T(r.log_scale), quat = T(r.quat), density = T(r.density);
+  const T unit = T(r.density_unit);
   const int64_t n = s.count, chunk = 2048;
   // Moments lie group by group: means [n,3], scales [n,3], quats [n,4], density [n].
   T *m1 = s.first, *v1 = s.second, *m2 = m1 + 3 * n, *v2 = v1 + 3 * n, *m3 = m1 + 6 * n, *v3 = v1 + 6 * n;

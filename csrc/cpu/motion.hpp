@@ -89,7 +89,8 @@ MotionNormal CpuRenderer<T>::motion_normal(const FrameIn& frame, const SplatsIn<
       memset(images, 0, (1 + kDirections) * plane * sizeof(T));
       for (int64_t i = band_start_[b]; i < band_start_[b + 1]; ++i) {
         const int32_t n = band_order_[i];
-        AddMotion<T> add{images, stride_, plane, top, P(stamps[n].amplitude), coefficients + static_cast<size_t>(n) * kMotion};
+        const T* c = coefficients + static_cast<size_t>(n) * kMotion;
+        AddMotion<T> add{images, stride_, plane, top, P(stamps[n].amplitude), c};
         walk<L>(stamps[n], top, bottom, add);
       }
       double* sums = partial + static_cast<size_t>(b) * kSums;

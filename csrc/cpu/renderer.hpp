@@ -173,7 +173,8 @@ class CpuRenderer final : public Renderer<T> {
           if (stamps_[first + i].x0 > stamps_[first + i].x1) clear_lane(d, i);
         store_pack<P>(v, first, end, d.mean, d.scale, d.quat, d.density);
         for (int i = 0; v_motion && i < n; ++i) {
-          const T part[6] = {d.torque.x.v[i], d.torque.y.v[i], d.torque.z.v[i], d.mean.x.v[i], d.mean.y.v[i], d.mean.z.v[i]};
+          const T part[6] = {d.torque.x.v[i], d.torque.y.v[i], d.torque.z.v[i],
+                             d.mean.x.v[i],   d.mean.y.v[i],   d.mean.z.v[i]};
           for (int k = 0; k < 6; ++k) sum[k] += part[k];
         }
       }

@@ -71,7 +71,8 @@ void voxelize(const GridIn& grid, const SplatsIn<T>& splats, T* volume, int thre
 }
 
 template <class T>
-void voxelize_vjp(const GridIn& grid, const SplatsIn<T>& splats, const T* v_volume, const SplatsOut<T>& v, int threads) {
+void voxelize_vjp(const GridIn& grid, const SplatsIn<T>& splats, const T* v_volume, const SplatsOut<T>& v,
+                  int threads) {
   using L = PackLanes<T>;
   using P = typename L::Value;
   auto read = [=, &grid](long row, int i) {

@@ -132,8 +132,9 @@ struct GatherBlob {
   // In mm.
   SPLAT_HD BlobMoments<T> total(const GridIn& grid) const {
     const T x(grid.voxel[2]), y(grid.voxel[1]), z(grid.voxel[0]);
-    return {L::sum(m.one),          x * L::sum(m.x),      y * L::sum(m.y),      z * L::sum(m.z),      x * x * L::sum(m.xx),
-            y * y * L::sum(m.yy), z * z * L::sum(m.zz), x * y * L::sum(m.xy), x * z * L::sum(m.xz), y * z * L::sum(m.yz)};
+    return {L::sum(m.one),        x * L::sum(m.x),      y * L::sum(m.y),      z * L::sum(m.z),
+            x * x * L::sum(m.xx), y * y * L::sum(m.yy), z * z * L::sum(m.zz),
+            x * y * L::sum(m.xy), x * z * L::sum(m.xz), y * z * L::sum(m.yz)};
   }
 };
 

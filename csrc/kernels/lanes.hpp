@@ -1,7 +1,7 @@
 // Lanes: who walks a footprint together.
 //
 // A row of a footprint is walked by `width` lanes, one pixel each. On the CPU the lanes are the
-// elements of one Pack and `Value` is that Pack; on CUDA they are the threads of a warp and `Value`
+// elements of one Pack and `Value` is that Pack; on CUDA they are threads of a warp and `Value`
 // is each thread's own number. The kernels are written once against these four names:
 //
 //   L::Value   a number for each lane          L::index()   0, 1, .. width-1
@@ -15,14 +15,15 @@ inline namespace SPLAT_NS {
 
 #if defined(__CUDACC__)
 
-template <class T>
+// Width consecutive threads of a warp; 32 / Width splats share it. Every thread of the warp must come to `sum`.
+template <class T, int Width>
 struct WarpLanes {
   using Scalar = T;
   using Value = T;
-  static constexpr int width = 32;
-  static __device__ __forceinline__ T index() { return static_cast<T>(threadIdx.x & 31); }
+  static constexpr int width = Width;
+  static __device__ __forceinline__ T index() { return static_cast<T>(threadIdx.x & (Width - 1)); }
   static __device__ __forceinline__ T sum(T v) {
-    for (int step = 16; step > 0; step >>= 1) v += __shfl_xor_sync(0xffffffffu, v, step);
+    for (int step = Width / 2; step > 0; step >>= 1) v += __shfl_xor_sync(0xffffffffu, v, step);
     return v;
   }
 };

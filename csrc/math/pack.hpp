@@ -32,20 +32,22 @@ SPLAT_HD T min_of(T a, T b) { return a < b ? a : b; }
 // device, so that CPU and GPU agree. Doubles take the library's.
 SPLAT_HD double exp2_of(double x) { return exp2(x); }
 
-// The polynomial: Chebyshev fit of 2^f on [-1/2, 1/2].
-inline constexpr float kExp2[6] = {1.000000075e+00f, 6.931472067e-01f, 2.402210736e-01f,
-                                   5.550327214e-02f, 9.676037098e-03f, 1.340043217e-03f};
+// 2^f on [-1/2, 1/2], Chebyshev fit. V: float or a pack of floats.
+template <class V>
+SPLAT_HD V exp2_of_fraction(V f) {
+  V y(1.340043217e-03f);
+  y = y * f + V(9.676037098e-03f);
+  y = y * f + V(5.550327214e-02f);
+  y = y * f + V(2.402210736e-01f);
+  y = y * f + V(6.931472067e-01f);
+  return y * f + V(1.000000075e+00f);
+}
 
 SPLAT_HD float exp2_of(float x) {
   const float magic = 12582912.0f;  // 1.5 * 2^23: adding it rounds to an integer
   const float shifted = x + magic;
   const float f = x - (shifted - magic);
-  float y = kExp2[5];
-  y = y * f + kExp2[4];
-  y = y * f + kExp2[3];
-  y = y * f + kExp2[2];
-  y = y * f + kExp2[1];
-  y = y * f + kExp2[0];
+  float y = exp2_of_fraction(f);
   int32_t bits, exponent;
   memcpy(&bits, &shifted, 4);
   memcpy(&exponent, &y, 4);
@@ -139,12 +141,7 @@ SPLAT_HD Pack<float, N> exp2_of(Pack<float, N> x) {
   const P magic(12582912.0f);
   const P shifted = x + magic;
   const P f = x - (shifted - magic);
-  P y(kExp2[5]);
-  y = y * f + P(kExp2[4]);
-  y = y * f + P(kExp2[3]);
-  y = y * f + P(kExp2[2]);
-  y = y * f + P(kExp2[1]);
-  y = y * f + P(kExp2[0]);
+  const P y = exp2_of_fraction(f);
   using Bits = typename P::Mask;
   return P((typename P::Register)((Bits)y.v + ((Bits)shifted.v << 23)));
 }
