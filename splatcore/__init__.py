@@ -17,15 +17,14 @@ os.environ.setdefault("GOMP_SPINCOUNT", "5000")
 
 __version__ = "0.1.0"
 
+# Functions named like their module (reconstruct, simulate, evaluate) are imported from it: a package
+# attribute of that name is the module itself as soon as anybody has imported it.
 _HOME = {
     "Options": "options",
     "Progress": "progress",
     "Scan": "scan",
     "check_scan": "scan",
-    "evaluate": "evaluate",
     "read_scan": "scan",
-    "reconstruct": "reconstruct",
-    "simulate": "simulate",
     "write_results": "results",
 }
 

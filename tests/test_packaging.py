@@ -52,6 +52,15 @@ def test_one_version_everywhere() -> None:
     assert f"## [{declared}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
+def test_the_public_names_of_the_engine_are_what_they_say() -> None:
+    """`from splatcore import name` gives the thing, never the module of that name, whatever was imported before."""
+    import splatcore
+
+    for file in (ROOT / "splatcore").glob("*.py"):
+        assert file.stem not in splatcore.__all__, file.stem
+    assert all(callable(getattr(splatcore, name)) for name in splatcore.__all__ if name != "__version__")
+
+
 def test_every_data_file_of_the_packages_is_in_the_wheel() -> None:
     """The wheel takes whole folders; nothing in .gitignore or the build's excludes may hide a file of theirs."""
     packages = MAIN["tool"]["scikit-build"]["wheel"]["packages"]
