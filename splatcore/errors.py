@@ -56,3 +56,5 @@ class ResultError(SplatCTError):
 
 class ReconstructionError(SplatCTError):
     """The engine cannot go on."""
+
+    exit_code = 1  # of the command line: the work failed; the others are wrong input, 2

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from splatcore.document import Document, shown
-from splatcore.errors import ScanError
+from splatcore.errors import Problem, ScanError
 from splatcore.geometry import Array, Frames
 from splatcore.reconstruction import Reconstruction
 from splatcore.scangeometry import read_frames
@@ -78,3 +78,17 @@ def read_poses(path: Path, detector: tuple[int, int] | None = None) -> tuple[dic
     if data is None or frames is None or doc.problems:
         raise ScanError(doc.all_problems())
     return data, frames
+
+
+def frames_for(given: Frames, path: Path) -> Frames:
+    """The frames of poses.json in place of a scan's own. Raises ScanError where they are of another kind of scan."""
+    _, frames = read_poses(path, (given.rows, given.cols))
+    for what, theirs, ours in (
+        ("beam", frames.beam, given.beam),
+        ("views", len(frames), len(given)),
+        ("detector (rows, cols)", (frames.rows, frames.cols), (given.rows, given.cols)),
+    ):
+        if theirs != ours:
+            hint = "give the poses of a scan with the same views on the same scanner"
+            raise ScanError([Problem(str(path), f"{what}: the poses have {theirs}, the scan {ours}", hint)])
+    return frames

@@ -16,18 +16,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scan", type=Path, help="folder with scan.json and TIFF files")
     parser.add_argument("-o", "--out", type=Path, required=True, help="the result folder to write")
     parser.add_argument("--overwrite", action="store_true", help="write into a folder that is not empty")
+    parser.add_argument(
+        "--poses", type=Path, help="poses.json of an earlier scan: start from its frames, not scan.json's"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress")
     add_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from splatcore.posefile import frames_for
     from splatcore.reconstruct import reconstruct
     from splatcore.results import prepare_folder, write_results
     from splatcore.scan import read_scan
 
     options = from_arguments(args)
     prepare_folder(args.out, args.overwrite)
-    events = reconstruct(read_scan(args.scan), options)
+    scan = read_scan(args.scan)
+    if args.poses:
+        scan = replace(scan, frames=frames_for(scan.frames, args.poses))
+    events = reconstruct(scan, options)
     last = ""
     try:
         while True:

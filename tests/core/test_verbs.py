@@ -1,0 +1,73 @@
+"""The engine's verbs as a user types them, on a small scan."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatcore.errors import ScanError
+from splatcore.posefile import frames_for
+from splatcore.scan import read_scan
+
+from .phantom import phantom
+
+
+def splatct(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "splatct_client", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("verbs")
+    np.savez(folder / "cube.npz", volume=phantom(32))
+    splatct("simulate", "--volume", folder / "cube.npz", "--out", folder / "scan", "--views", 24, "--det", 64,
+            "--sigma-rot", 0.03, "--sigma-trans", 1, "--noise", "r2", "--seed", 0)  # fmt: skip
+    splatct("reconstruct", folder / "scan", "-o", folder / "out", "--threads", 1, "--quality", "preview")
+    return folder
+
+
+def test_results_are_written_and_scored(work):
+    names = {path.name for path in (work / "out").iterdir()}
+    assert names == {"volume.tif", "poses.json", "report.json", "report.html", "splats.npz", "manifest.json"}
+    scores = json.loads(splatct("evaluate", work / "out", "--truth", work / "scan", "--json").stdout)
+    assert scores["rot_deg_aligned"] < scores["nominal"]["rot_deg"] / 3
+    assert "aligned" in splatct("evaluate", work / "out", "--truth", work / "scan").stdout
+
+
+def test_a_full_folder_is_refused_before_the_work(work):
+    done = splatct("reconstruct", work / "scan", "-o", work / "out", code=2)
+    assert "not empty" in done.stderr and "--overwrite" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_poses_of_an_earlier_run_are_a_start(work):
+    splatct("reconstruct", work / "scan", "-o", work / "again", "--poses", work / "out" / "poses.json", "--calibrate",
+            "none", "--threads", 1, "--quality", "preview")  # fmt: skip
+    scores = json.loads(splatct("evaluate", work / "again", "--truth", work / "scan", "--json").stdout)
+    first = json.loads(splatct("evaluate", work / "out", "--truth", work / "scan", "--json").stdout)
+    assert scores["rot_deg_aligned"] == pytest.approx(first["rot_deg_aligned"], rel=1e-6)
+    assert scores["psnr_aligned"] > first["psnr_aligned"] - 1
+
+
+def test_poses_of_another_scan_are_refused(work, tmp_path):
+    given = read_scan(work / "scan").frames
+    with pytest.raises(ScanError, match="24"):
+        frames_for(given[:5], work / "out" / "poses.json")
+
+
+def test_simulate_does_not_overwrite_silently(work):
+    done = splatct("simulate", "--volume", work / "cube.npz", "--out", work / "scan", code=2)
+    assert "not empty" in done.stderr
+
+
+def test_wrong_volume_is_named(work, tmp_path):
+    (tmp_path / "junk.npz").write_bytes(b"nothing")
+    done = splatct("simulate", "--volume", tmp_path / "junk.npz", "--out", tmp_path / "scan", code=2)
+    assert "junk.npz" in done.stderr and "Traceback" not in done.stderr
