@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Response
 from fastapi.staticfiles import StaticFiles
 
 from server import health, janitor, jobs, pages, problems, results, scans, uploads
@@ -19,6 +20,15 @@ from server.service import Service
 from server.settings import Settings
 from server.store import Store
 from worker.database import Database
+
+
+class _Static(StaticFiles):
+    """The page's files, asked for anew each time: after an upgrade no browser mixes old code with new."""
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        response = super().file_response(*args, **kwargs)
+        response.headers["Cache-Control"] = "no-cache"
+        return response
 
 
 def create_app(settings: Settings) -> FastAPI:
@@ -66,5 +76,5 @@ def create_app(settings: Settings) -> FastAPI:
     for part in (uploads, scans, jobs, results, health):
         app.include_router(part.router)
     app.include_router(pages.router)
-    app.mount("/static", StaticFiles(directory=Path(__file__).parent / "static"), name="static")
+    app.mount("/static", _Static(directory=Path(__file__).parent / "static"), name="static")
     return app

@@ -263,5 +263,6 @@ class _Run:
             return np.zeros((len(corrected), 3)), np.zeros((len(corrected), 3))
         omega, tau = sigmas(self._normals, self._prior)
         if corrected.beam == "parallel":
-            tau = np.where(np.abs(self._scan.frames.source) > 0.5, np.inf, tau)
+            # A shift along the ray changes nothing, so any component that shares in it is unbounded.
+            tau = np.where(np.abs(self._scan.frames.source) > 1e-3, np.inf, tau)
         return omega, tau
