@@ -36,9 +36,9 @@ LANES = {"avx512": 16, "avx2": 8, "plain": 4}  # floats in a register
 #   value: 3 for the exponent (a sum, a multiply-add), 13 for 2^x (three for the remainder, five multiply-adds)
 VALUE = 3 + 13
 FORWARD = VALUE + 2  # image += amplitude e
-BACKWARD = VALUE + 12  # g e, g e dx; six sums, of which four multiply
-MOTION = VALUE + 2 + 12 * 6  # the value; for each direction a line in dx (2 + 2), added times the value (2)
-NORMAL = 12 + 2 * 78 + 2 * 12 + 10  # per detector pixel: w d, the 78 products d d', 12 of d r, the plain sums
+BACKWARD = VALUE + 6  # g e, times dy; three sums, of which one multiplies
+MOTION = VALUE + 2 + 12 * 6  # the value; for each direction a line in dy twice (2 + 2), and a multiply-add of the value
+NORMAL = 13 + 2 * (78 + 13) + 10  # per detector pixel: root weights; products of the 13 images; the plain sums
 # Of one splat, counted in csrc/math and kernels/stamp.hpp (cone beam; a root or a division is one).
 #   offset and q 19, J 20, det J 10, axes 57, clearance 28, T 30, W and S^-1 57, amplitude 8; the stamp 36
 PROJECT = 19 + 20 + 10 + 57 + 28 + 30 + 57 + 8

@@ -9,65 +9,88 @@
 namespace splat {
 inline namespace SPLAT_NS {
 
-inline constexpr int kPairs = kDirections * (kDirections + 1) / 2;
-inline constexpr int kSums = kPairs + kDirections + 4;
+inline constexpr int kRows = 1 + kDirections;         // the residual and its derivatives
+inline constexpr int kSums = kRows * kRows + 3;       // their products; r^2, |r| and pixels
 
 // Draws value and derivatives: 2^(..) times a quadratic in (dx, dy) for each direction.
 template <class T>
 struct AddMotion {
   using P = typename PackLanes<T>::Value;
-  T* images;       // [1 + kDirections] of rows x stride, row `top` first
+  T* images;       // [kRows] of rows x stride, row `top` first
   long stride, plane;
   int top;
   P amplitude;
   const T* c;      // [kMotion]
-  SPLAT_HD void operator()(int x, int y, P dx, T dy, P e) {
-    T* at = images + (y - top) * stride + x;
-    const P value = amplitude * e;
-    (P::load(at) + value).store(at);
+  P flat[kDirections], lean[kDirections];  // of the present columns: what dy^0 and dy^1 have as factors
+  SPLAT_HD void enter(P dx) {
     for (int k = 0; k < kDirections; ++k) {
       const T* q = c + 6 * k;
-      const P d = P(q[0] + dy * (q[2] + dy * q[5])) + dx * (P(q[1] + dy * q[4]) + dx * P(q[3]));
+      flat[k] = P(q[0]) + dx * (P(q[1]) + dx * P(q[3]));
+      lean[k] = P(q[2]) + dx * P(q[4]);
+    }
+  }
+  SPLAT_HD void leave(P) {}
+  SPLAT_HD void operator()(int x, int y, P, T dy, P e) {
+    T* at = images + (y - top) * stride + x;
+    const P value = amplitude * e, down(dy);
+    (P::load(at) + value).store(at);
+    for (int k = 0; k < kDirections; ++k) {
+      const P d = flat[k] + down * (lean[k] + down * P(c[6 * k + 5]));
       T* to = at + (k + 1) * plane;
       (P::load(to) + value * d).store(to);
     }
   }
 };
 
-// Sums one row of a band: weights w = slope(r) / r of the Huber loss, times the mask.
+// sums[i * kRows + j] += <a_i, b_j> for m x n rows that lie `plane` apart.
+template <int m, int n, class T>
+inline void add_products(const T* a, const T* b, long plane, int cols, double* sums) {
+  using P = typename PackLanes<T>::Value;
+  P acc[m * n];
+  for (P& s : acc) s = P(T(0));
+  for (int x = 0; x < cols; x += P::size) {
+    P u[m], v[n];
+    for (int i = 0; i < m; ++i) u[i] = P::load(a + i * plane + x);
+    for (int j = 0; j < n; ++j) v[j] = P::load(b + j * plane + x);
+    for (int i = 0; i < m; ++i)
+      for (int j = 0; j < n; ++j) acc[i * n + j] += u[i] * v[j];
+  }
+  for (int i = 0; i < m; ++i)
+    for (int j = 0; j < n; ++j) sums[i * kRows + j] += sum_of(acc[i * n + j]);
+}
+
+// Sums one row of a band, which it overwrites: residual and derivatives times the root of the weight, then their
+// products four by four, as many as registers hold. The weight is slope(r) / r of the Huber loss times the mask.
 template <class T>
-inline void add_normal_row(const T* images, long plane, const T* target, const T* mask, int cols, T delta,
-                           double* sums /* [kSums] */) {
+inline void add_normal_row(T* images, long plane, const T* target, const T* mask, int cols, T delta,
+                           double* sums /* [kSums], of the products only those with i >= j or both in one block */) {
   using P = typename PackLanes<T>::Value;
   constexpr int N = PackLanes<T>::width;
-  P acc[kSums];
-  for (P& a : acc) a = P(T(0));
+  P squares(T(0)), sizes(T(0)), pixels(T(0));
   for (int x = 0; x < cols; x += N) {
-    T want[N], weight[N], on[N];
+    T want[N], on[N];
     const int n = cols - x < N ? cols - x : N;
     for (int i = 0; i < N; ++i) {
-      const T w = i < n ? (mask ? mask[x + i] : T(1)) : T(0);
       want[i] = i < n ? target[x + i] : T(0);
-      const T r = images[x + i] - want[i], size = r < T(0) ? -r : r;
-      weight[i] = size > delta ? w * delta / size : w;
-      on[i] = w;
+      on[i] = i < n ? (mask ? mask[x + i] : T(1)) : T(0);
     }
-    const P w = P::load(weight), m = P::load(on), r = P::load(images + x) - P::load(want);
-    P d[kDirections];
-    int at = 0;
-    for (int k = 0; k < kDirections; ++k) {
-      d[k] = P::load(images + (k + 1) * plane + x);
-      const P wd = w * d[k];
-      for (int l = 0; l <= k; ++l) acc[at++] += wd * d[l];
-      acc[kPairs + k] += wd * r;
-    }
-    acc[kPairs + kDirections + 0] += w * r * r;
-    acc[kPairs + kDirections + 1] += m * r * r;
-    acc[kPairs + kDirections + 2] += m * max_of(r, -r);
-    acc[kPairs + kDirections + 3] += m;
+    const P m = P::load(on), r = P::load(images + x) - P::load(want), size = max_of(r, -r);
+    squares += m * r * r;
+    sizes += m * size;
+    pixels += m;
+    const P root = sqrt_of(select(size > P(delta), m * P(delta) / size, m));
+    (root * r).store(images + x);
+    for (int k = 1; k < kRows; ++k) (root * P::load(images + k * plane + x)).store(images + k * plane + x);
   }
-  for (int k = 0; k < kSums; ++k)
-    for (int i = 0; i < N; ++i) sums[k] += acc[k].v[i];
+  const T* d = images + plane;
+  double* products = sums + kRows + 1;
+  add_products<kRows, 1>(images, images, plane, cols, sums);
+  for (int i = 0; i < kDirections; i += 4)
+    for (int j = 0; j <= i; j += 4)
+      add_products<4, 4>(d + i * plane, d + j * plane, plane, cols, products + i * kRows + j);
+  sums[kRows * kRows] += sum_of(squares);
+  sums[kRows * kRows + 1] += sum_of(sizes);
+  sums[kRows * kRows + 2] += sum_of(pixels);
 }
 
 template <class T>
@@ -82,15 +105,21 @@ MotionNormal CpuRenderer<T>::motion_normal(const FrameIn& frame, const SplatsIn<
 #pragma omp parallel num_threads(threads_)
   {
     Buffer<T> scratch;
-    T* images = scratch.reserve((1 + kDirections) * plane);
+    T* images = scratch.reserve(kRows * plane);
 #pragma omp for schedule(dynamic, 1)
     for (int b = 0; b < bands_; ++b) {
       const int top = b * kBand, bottom = top + kBand < rows_ ? top + kBand : rows_;
-      memset(images, 0, (1 + kDirections) * plane * sizeof(T));
-      for (int64_t i = band_start_[b]; i < band_start_[b + 1]; ++i) {
+      memset(images, 0, kRows * plane * sizeof(T));
+      const int64_t end = band_start_[b + 1];
+      for (int64_t i = band_start_[b]; i < end; ++i) {
         const int32_t n = band_order_[i];
+        if (i + 1 < end) {
+          const int64_t next = band_order_[i + 1];
+          __builtin_prefetch(stamps + next);
+          for (int k = 0; k < kMotion; k += 64 / sizeof(T)) __builtin_prefetch(coefficients + next * kMotion + k);
+        }
         const T* c = coefficients + static_cast<size_t>(n) * kMotion;
-        AddMotion<T> add{images, stride_, plane, top, P(stamps[n].amplitude), c};
+        AddMotion<T> add{images, stride_, plane, top, P(stamps[n].amplitude), c, {}, {}};
         walk<L>(stamps[n], top, bottom, add);
       }
       double* sums = partial + static_cast<size_t>(b) * kSums;
@@ -106,13 +135,15 @@ MotionNormal CpuRenderer<T>::motion_normal(const FrameIn& frame, const SplatsIn<
   for (int b = 0; b < bands_; ++b)
     for (int k = 0; k < kSums; ++k) sums[k] += partial[static_cast<size_t>(b) * kSums + k];
   MotionNormal normal;
-  for (int k = 0, at = 0; k < kDirections; ++k)
-    for (int l = 0; l <= k; ++l) normal.hessian[kDirections * k + l] = normal.hessian[kDirections * l + k] = sums[at++];
-  for (int k = 0; k < kDirections; ++k) normal.gradient[k] = sums[kPairs + k];
-  normal.weighted_ss = sums[kPairs + kDirections + 0];
-  normal.residual_ss = sums[kPairs + kDirections + 1];
-  normal.residual_abs = sums[kPairs + kDirections + 2];
-  normal.pixels = sums[kPairs + kDirections + 3];
+  for (int k = 0; k < kDirections; ++k) {
+    normal.gradient[k] = sums[(k + 1) * kRows];
+    for (int l = 0; l <= k; ++l)
+      normal.hessian[kDirections * k + l] = normal.hessian[kDirections * l + k] = sums[(k + 1) * kRows + l + 1];
+  }
+  normal.weighted_ss = sums[0];
+  normal.residual_ss = sums[kRows * kRows];
+  normal.residual_abs = sums[kRows * kRows + 1];
+  normal.pixels = sums[kRows * kRows + 2];
   return normal;
 }
 

@@ -15,6 +15,7 @@ namespace splat {
 inline namespace SPLAT_NS {
 
 inline constexpr int kBand = 16;     // rows a band
+inline constexpr int kAhead = 8;     // stamps
 inline constexpr int kChunk = 512;   // splats a chunk; a multiple of every pack's size
 inline constexpr int kMotion = 6 * kDirections;  // six polynomial coefficients for each direction
 
@@ -111,6 +112,8 @@ class CpuRenderer final : public Renderer<T> {
     T* image;
     long stride;
     P amplitude;
+    SPLAT_HD void enter(P) {}
+    SPLAT_HD void leave(P) {}
     SPLAT_HD void operator()(int x, int y, P, T, P e) {
       T* at = image + y * stride + x;
       (P::load(at) + amplitude * e).store(at);
@@ -125,7 +128,10 @@ class CpuRenderer final : public Renderer<T> {
     for (int b = 0; b < bands_; ++b) {
       const int top = b * kBand, bottom = top + kBand < rows_ ? top + kBand : rows_;
       memset(line(image_, top), 0, static_cast<size_t>(bottom - top) * stride_ * sizeof(T));
-      for (int64_t i = band_start_[b]; i < band_start_[b + 1]; ++i) {
+      const int64_t end = band_start_[b + 1];
+      for (int64_t i = band_start_[b]; i < end; ++i) {
+        // A band's stamps lie scattered in memory; ask for them ahead of time.
+        if (i + kAhead < end) __builtin_prefetch(stamps + band_order_[i + kAhead]);
         const Stamp<T>& s = stamps[band_order_[i]];
         Add add{image_.data(), stride_, P(s.amplitude)};
         walk<L>(s, top, bottom, add);

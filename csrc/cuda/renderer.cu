@@ -12,6 +12,7 @@ inline namespace SPLAT_NS {
 
 inline constexpr int kLanes = 8;      // threads a splat
 inline constexpr int kThreads = 128;  // threads a block
+inline constexpr int kBlocks = 3;     // blocks a multiprocessor at least: up to 168 registers a thread
 
 template <class T>
 using Lanes = WarpLanes<T, kLanes>;
@@ -24,7 +25,7 @@ inline unsigned blocks_for(int64_t threads) { return static_cast<unsigned>((thre
 // ---- the detector ----------------------------------------------------------------------------------
 
 template <class T>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kBlocks)
 stamp_kernel(View<T> view, SplatsIn<T> splats, int rows, int cols, Stamp<T>* stamps) {
   const int64_t n = thread_index();
   if (n >= splats.count) return;
@@ -37,6 +38,8 @@ struct AddPixels {
   unsigned long long* sums;
   int cols;
   T amplitude;
+  __device__ void enter(T) {}
+  __device__ void leave(T) {}
   __device__ void operator()(int x, int y, T, T, T e) {
     const int column = x + (threadIdx.x & (kLanes - 1));
     if (column < cols) add_exactly(sums + static_cast<int64_t>(y) * cols + column, amplitude * e);
@@ -44,7 +47,7 @@ struct AddPixels {
 };
 
 template <class T>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kBlocks)
 forward_kernel(const Stamp<T>* stamps, int64_t count, int rows, int cols, unsigned long long* sums) {
   const int64_t n = thread_index() / kLanes;
   if (n >= count) return;
@@ -54,7 +57,7 @@ forward_kernel(const Stamp<T>* stamps, int64_t count, int rows, int cols, unsign
 }
 
 template <class T>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kBlocks)
 from_units_kernel(const unsigned long long* sums, int64_t count, T* out) {
   const int64_t n = thread_index();
   if (n < count) out[n] = from_units<T>(sums[n]);
@@ -72,7 +75,7 @@ struct ReadPixels {
 
 // moments [count]: overwrites.
 template <class T>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kBlocks)
 gather_kernel(const Stamp<T>* stamps, int64_t count, int rows, int cols, const T* v_image, Moments<T>* moments) {
   const int64_t n = thread_index() / kLanes;
   Stamp<T> s = stamps[n < count ? n : count - 1];
@@ -85,7 +88,7 @@ gather_kernel(const Stamp<T>* stamps, int64_t count, int rows, int cols, const T
 
 // From moments to gradients. partial [blocks, 6]: the block's sum of dL/d(omega, tau), in a fixed tree.
 template <class T>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kBlocks)
 reverse_kernel(View<T> view, SplatsIn<T> splats, const Stamp<T>* stamps, const Moments<T>* moments, SplatsOut<T> v,
                double* partial) {
   const int64_t n = thread_index();
@@ -136,7 +139,7 @@ struct AddVoxels {
 };
 
 template <class T>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kBlocks)
 voxelize_kernel(GridIn grid, SplatsIn<T> splats, unsigned long long* sums) {
   const int64_t n = thread_index() / kLanes;
   if (n >= splats.count) return;
@@ -157,7 +160,7 @@ struct ReadVoxels {
 
 // moments [count]: overwrites.
 template <class T>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kBlocks)
 gather_voxels_kernel(GridIn grid, SplatsIn<T> splats, const T* v_volume, BlobMoments<T>* moments) {
   const int64_t n = thread_index() / kLanes;
   const Blob<T> b = blob_of(grid, load_one(splats, n < splats.count ? n : splats.count - 1));
@@ -168,7 +171,7 @@ gather_voxels_kernel(GridIn grid, SplatsIn<T> splats, const T* v_volume, BlobMom
 }
 
 template <class T>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kBlocks)
 reverse_voxels_kernel(GridIn grid, SplatsIn<T> splats, const BlobMoments<T>* moments, SplatsOut<T> v) {
   const int64_t n = thread_index();
   if (n >= splats.count) return;
@@ -195,8 +198,8 @@ void CudaRenderer<T>::render(const FrameIn& frame, const SplatsIn<T>& splats, T*
 }
 
 template <class T>
-void CudaRenderer<T>::render_vjp(const FrameIn& frame, const SplatsIn<T>& splats, const T* v_image, const SplatsOut<T>& v,
-                                 double* v_motion) {
+void CudaRenderer<T>::render_vjp(const FrameIn& frame, const SplatsIn<T>& splats, const T* v_image,
+                                 const SplatsOut<T>& v, double* v_motion) {
   const View<T> view = make_view<T>(frame, rows_, cols_);
   const unsigned blocks = blocks_for(splats.count);
   auto* stamps = reinterpret_cast<Stamp<T>*>(stamps_.reserve(splats.count * sizeof(Stamp<T>)));

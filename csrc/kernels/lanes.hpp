@@ -48,11 +48,7 @@ struct PackLanes {
     for (int i = 0; i < width; ++i) r.v[i] = static_cast<T>(i);
     return r;
   }
-  static SPLAT_HD T sum(Value v) {
-    T s(0);
-    for (int i = 0; i < width; ++i) s += v.v[i];
-    return s;
-  }
+  static SPLAT_HD T sum(Value v) { return sum_of(v); }
 };
 
 #endif

@@ -59,8 +59,9 @@ SPLAT_HD Stamp<T> make_stamp(const Footprint<T>& f, T clearance, int rows, int c
   return s;
 }
 
-// Calls visit(x, y, dx, dy, e) for every `width` pixels (x + lane, y) of the stamp in rows
-// [row_begin, row_end): e is the unit-amplitude value, zero beyond the cutoff.
+// Calls visit(x, y, dx, dy, e) for every `width` pixels (x + lane, y) of the stamp in rows [row_begin, row_end): e is
+// the unit-amplitude value, zero beyond the cutoff. It goes down columns: visit.enter(dx) comes before the rows of
+// a group of columns and visit.leave(dx) after them, so that what depends on dx alone is done once.
 template <class L, class T, class Visit>
 SPLAT_HD void walk(const Stamp<T>& s, int row_begin, int row_end, Visit& visit) {
   using V = typename L::Value;
@@ -75,12 +76,15 @@ SPLAT_HD void walk(const Stamp<T>& s, int row_begin, int row_end, Visit& visit) 
     last = last < row_end - 1 ? last : row_end - 1;
     const V dx = L::index() + V(T(x) - s.column);
     const V along = V(s.a) * dx * dx, mixed = V(s.b) * dx;
+    if (y > last) continue;
+    visit.enter(dx);
     for (; y <= last; ++y) {
       const T dy = T(y) - s.row;
       const V power = along + V(dy) * (mixed + V(s.c * dy));
       const V e = select(power > limit, exp2_of(power), zero);
       visit(x, y, dx, dy, e);
     }
+    visit.leave(dx);
   }
 }
 
@@ -90,15 +94,22 @@ struct GatherMoments {
   using V = typename L::Value;
   Read read;  // read(x, y): the gradient at pixels x + lane of row y, zero outside the image
   V one{T(0)}, x{T(0)}, xx{T(0)}, y{T(0)}, xy{T(0)}, yy{T(0)};
-  SPLAT_HD void operator()(int px, int py, V dx, T dy, V e) {
-    const V g = read(px, py) * e, gx = g * dx;
-    const V down(dy);
-    one += g;
+  V g0{T(0)}, g1{T(0)}, g2{T(0)};  // of the present columns: sums of G e times 1, dy, dy^2
+  SPLAT_HD void enter(V) { g0 = g1 = g2 = V(T(0)); }
+  SPLAT_HD void operator()(int px, int py, V, T dy, V e) {
+    const V g = read(px, py) * e, gy = g * V(dy);
+    g0 += g;
+    g1 += gy;
+    g2 += gy * V(dy);
+  }
+  SPLAT_HD void leave(V dx) {
+    const V gx = g0 * dx;
+    one += g0;
     x += gx;
     xx += gx * dx;
-    y += g * down;
-    xy += gx * down;
-    yy += g * V(dy * dy);
+    y += g1;
+    xy += g1 * dx;
+    yy += g2;
   }
   SPLAT_HD Moments<T> total() const {
     return {L::sum(one), L::sum(x), L::sum(y), L::sum(xx), L::sum(xy), L::sum(yy)};

@@ -135,6 +135,20 @@ SPLAT_HD Pack<T, N> max_of(Pack<T, N> a, Pack<T, N> b) { return select(a > b, a,
 template <class T, int N>
 SPLAT_HD Pack<T, N> min_of(Pack<T, N> a, Pack<T, N> b) { return select(a < b, a, b); }
 
+// The sum of the elements, halves first: a fixed order for each N.
+template <class T, int N>
+SPLAT_HD T sum_of(Pack<T, N> x) {
+  if constexpr (N * sizeof(T) > 16) {
+    typename VectorOf<T, N / 2>::Register half[2];
+    memcpy(half, &x.v, sizeof half);
+    return sum_of(Pack<T, N / 2>(half[0] + half[1]));
+  } else if constexpr (N == 4) {
+    return (x.v[0] + x.v[2]) + (x.v[1] + x.v[3]);
+  } else {
+    return x.v[0] + x.v[1];
+  }
+}
+
 template <int N>
 SPLAT_HD Pack<float, N> exp2_of(Pack<float, N> x) {
   using P = Pack<float, N>;
