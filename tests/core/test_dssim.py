@@ -53,7 +53,7 @@ def native(
     splats = [t.detach() for t in leaves]
     gradients = [torch.empty_like(t) for t in splats]
     make = _native.Renderer64 if target.dtype == torch.float64 else _native.Renderer32
-    loss = make(ROWS, COLS, 2).loss_vjp(view, cone, *splats, target, mask, HUBER, dssim, RANGE, *gradients)  # type: ignore[call-arg, arg-type]
+    loss = make(ROWS, COLS, 2).loss_vjp(view, cone, *splats, target, mask, HUBER, dssim, RANGE, *gradients)
     return loss, gradients
 
 
@@ -98,6 +98,6 @@ def test_images_smaller_than_the_window(shape: tuple[int, int]) -> None:
     target = torch.tensor(np.random.default_rng(0).uniform(0, 0.3, shape))
     gradients = [torch.empty_like(t) for t in c.tensors()]
     renderer = _native.Renderer64(*shape, 2)
-    loss = renderer.loss_vjp(view, False, *c.tensors(), target, None, HUBER, 1.0, RANGE, *gradients)  # type: ignore[call-arg, arg-type]
+    loss = renderer.loss_vjp(view, False, *c.tensors(), target, None, HUBER, 1.0, RANGE, *gradients)
     image = ops.render(*c.tensors(), NO_MOTION, view, False, *shape)
     assert loss == pytest.approx(float((1 - mean_ssim(image, target)) / 2), rel=1e-12)

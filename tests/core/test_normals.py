@@ -38,7 +38,7 @@ def native(
     hessian, gradient = torch.empty(12, 12, dtype=torch.float64), torch.empty(12, dtype=torch.float64)
     sums = make(ROWS, COLS, 2).motion_normal(
         view, beam == "cone", *cloud.tensors(), target, mask, huber, hessian, gradient
-    )  # type: ignore[call-arg, arg-type]
+    )
     return Sums(hessian, gradient, *sums)
 
 
