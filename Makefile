@@ -40,8 +40,9 @@ check: build  ## format, lint, types, import rules
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
 
-bench: build  ## how fast the kernels are, and the share of this machine's peak
+bench: build  ## how fast the kernels are; how near calibration comes to knowing the poses
 	@$(BIN)/python bench/kernels.py
+	@$(BIN)/python bench/ceiling.py examples/head
 
 clean:  ## what was built and cached; .venv and your data stay
 	rm -rf build dist $(VENV)/.built .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
