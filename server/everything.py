@@ -31,6 +31,8 @@ def run_everything(settings: Settings, workers: int, has_redis: bool, ready: Cal
     stop = threading.Event()
     for which in (signal.SIGINT, signal.SIGTERM):
         signal.signal(which, lambda *_: stop.set())
+    if settings.data.exists() and not settings.data.is_dir():
+        raise SettingsError(f"data: {settings.data} is a file, expected a folder; choose another with --data")
     settings.data.mkdir(parents=True, exist_ok=True)
     with _only_one(settings.data), contextlib.ExitStack() as cleanup:
         redis = None

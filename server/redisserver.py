@@ -27,6 +27,8 @@ _START_S = 15.0
 class RedisUnavailable(SplatCTError):
     """No Redis could be started."""
 
+    exit_code = 1  # of the command line: not the fault of what was given
+
 
 def find_program() -> Path:
     """redis-server or valkey-server of the system, else the embedded Valkey."""

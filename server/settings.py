@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import ipaddress
 
-from splatcore.errors import SplatCTError
-from worker.settings import WorkerSettings
+from pydantic import Field
+
+from worker.settings import SettingsError, WorkerSettings
+
+__all__ = ["MIB", "Settings", "SettingsError"]
 
 MIB = 1 << 20
 
 
-class SettingsError(SplatCTError):
-    """A setting cannot be used."""
-
-
 class Settings(WorkerSettings):
     host: str = "127.0.0.1"
-    port: int = 8080
+    port: int = Field(default=8080, ge=0, le=65535)
     # A promise by whoever runs us in a container: its port is published on the host's loopback address alone.
     published_on_loopback: bool = False
     check: str = "splatcore.check"  # for tests: the module that judges an uploaded scan

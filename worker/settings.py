@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Self
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from splatcore.errors import SplatCTError
+
+
+class SettingsError(SplatCTError):
+    """A setting cannot be used."""
 
 
 class WorkerSettings(BaseSettings):
@@ -19,6 +27,18 @@ class WorkerSettings(BaseSettings):
     job_seconds: float = 24 * 3600.0  # longest a job may run
     cancel_grace_s: float = 10.0  # time for the engine to stop by itself before it is terminated
     engine: str = "splatcore"  # for tests: the package the engine process takes its functions from
+
+    @classmethod
+    def read(cls, given: Mapping[str, object]) -> Self:
+        """The environment's settings; what the command line gives, and is not None, comes first."""
+        try:
+            return cls(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
+        except ValidationError as error:
+            faults = []
+            for fault in error.errors():
+                name = str(fault["loc"][0])
+                faults.append(f"{name} (SPLATCT_{name.upper()}): got {fault['input']!r}; {fault['msg']}")
+            raise SettingsError("\n".join(faults)) from None
 
     @property
     def database(self) -> str:

@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     if args.tie_to is not None:
         die_with_parent(args.tie_to, signal.SIGTERM)
     given = {name: getattr(args, name) for name in ("data", "host", "port")}
-    settings = Settings(**{name: value for name, value in given.items() if value is not None})
+    settings = Settings.read(given)
     settings.require_loopback()
     os.umask(0o077)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")

@@ -17,22 +17,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     import logging
     import os
-    import sys
 
     from server.everything import run_everything
     from server.settings import Settings
-    from splatcore.errors import SplatCTError
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
     os.umask(0o077)
     given = {name: getattr(args, name) for name in ("data", "port")}
-    settings = Settings(**{name: value for name, value in given.items() if value is not None})
+    settings = Settings.read(given)
 
     def ready(url: str) -> None:
         print(f"SplatCT is ready: {url}  (Ctrl-C stops it)", flush=True)
 
-    try:
-        return run_everything(settings, args.workers, bool(os.environ.get("SPLATCT_REDIS_URL")), ready)
-    except SplatCTError as error:
-        print(f"splatct up: {error}", file=sys.stderr)
-        return 1
+    return run_everything(settings, args.workers, bool(os.environ.get("SPLATCT_REDIS_URL")), ready)

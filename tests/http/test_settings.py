@@ -20,6 +20,16 @@ def test_environment_there_and_back(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert Settings() == settings
 
 
+def test_what_the_command_line_gives_comes_first_and_every_fault_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPLATCT_PORT", "abc")
+    assert Settings.read({"port": 9000, "data": None}).port == 9000
+    monkeypatch.setenv("SPLATCT_JOB_SECONDS", "long")
+    with pytest.raises(SettingsError, match=r"(?s)SPLATCT_JOB_SECONDS\): got 'long'.*SPLATCT_PORT\): got 'abc'"):
+        Settings.read({})
+    with pytest.raises(SettingsError, match=r"port .*got 99999"):
+        Settings.read({"port": 99999})
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "example.org", ""])
 def test_only_loopback_is_served(host: str) -> None:
     with pytest.raises(SettingsError, match="no authentication"):

@@ -13,6 +13,9 @@ from pathlib import Path
 import httpx
 import pytest
 
+from server.everything import run_everything
+from server.settings import Settings, SettingsError
+
 from .stack import PYTHONPATH, Stack, commit, scan_files, submit
 
 
@@ -86,3 +89,9 @@ def test_a_second_one_on_the_same_data_is_refused(up: Up) -> None:
     assert second.process.wait(20) == 1 and second.line == ""
     second.close()
     assert up.process.poll() is None
+
+
+def test_a_file_for_the_data_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "data").write_text("mine")
+    with pytest.raises(SettingsError, match="is a file, expected a folder"):
+        run_everything(Settings(data=tmp_path / "data", port=0), 1, True, print)

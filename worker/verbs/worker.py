@@ -24,8 +24,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.tie_to is not None:
         die_with_parent(args.tie_to, signal.SIGTERM)
-    given = {} if args.data is None else {"data": args.data}
-    settings = WorkerSettings(**given)
+    settings = WorkerSettings.read({"data": args.data})
     os.environ.update(settings.to_environment())  # the forked child reads its settings anew
     os.umask(0o077)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
