@@ -17,12 +17,20 @@ import numpy as np
 import tifffile
 
 from splatcore import _native
-from splatcore.errors import Problem, ScanError
+from splatcore.errors import OptionsError, Problem, ResultError, ScanError
 from splatcore.geometry import Array, Frames, RigidMotions, circular, rotation_from_vector
 from splatcore.grid import VolumeGrid
 from splatcore.splats import Floats, grid_array
 
 _WIDTH_MM, _DSO_MM, _DSD_MM, _DETECTOR_MM, _UNIT = 200.0, 500.0, 700.0, 400.0, 0.01
+
+# What can be simulated, lowest and highest.
+_RANGES = {
+    "views": (1, 100_000), "det": (1, 32_768), "arc_deg": (1e-3, 36_000.0), "sigma_rot": (0.0, 10.0),
+    "sigma_trans": (0.0, 1e4), "i0": (1.0, 1e15), "sigma_counts": (0.0, 1e15), "seed": (0, 2**63 - 1),
+    "offset_px": (-1e5, 1e5), "roll_deg": (-360.0, 360.0), "tilt_deg": (-89.0, 89.0), "yaw_deg": (-89.0, 89.0),
+    "axis_pitch_deg": (-89.0, 89.0),
+}  # fmt: skip
 
 Noise = Literal["none", "r2", "physical"]
 Store = Literal["float32", "uint16"]
@@ -50,6 +58,13 @@ class Simulation:
     flip_u: bool = False
     flip_v: bool = False
     store: Store = "float32"
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            for number in value if isinstance(value, tuple) else (value,):
+                if number is not None and not low <= number <= high:  # true for nan
+                    raise OptionsError(f"{name}: got {number:g}, expected {low:g} to {high:g}")
 
 
 def draw_motions(views: int, sigma_rot: float, sigma_trans_mm: float, rng: np.random.Generator) -> RigidMotions:
@@ -116,14 +131,10 @@ def simulate(
         images, true = images[:, :, ::-1], replace(true, u=-true.u)
     if what.flip_v:
         images, true = images[:, ::-1, :], replace(true, v=-true.v)
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
-    scale = _write_images(out / "projections.tif", np.ascontiguousarray(images), what.store)
-    tifffile.imwrite(out / "truth.tif", attenuation, photometric="minisblack", compression="zlib", predictor=False)
-    document = {
+    document: dict[str, Any] = {
         "format": "splatct-scan/1",
         "name": name,
-        "projections": {"files": ["projections.tif"], "kind": "line_integrals", "scale": scale},
+        "projections": {"files": ["projections.tif"], "kind": "line_integrals", "scale": 1.0},
         "geometry": {
             "beam": "cone",
             "dso_mm": _DSO_MM,
@@ -139,7 +150,15 @@ def simulate(
             "options": asdict(what),
         },
     }
-    (out / "scan.json").write_text(json.dumps(document), encoding="utf-8")
+    out = Path(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        scale = _write_images(out / "projections.tif", np.ascontiguousarray(images), what.store)
+        document["projections"]["scale"] = scale
+        tifffile.imwrite(out / "truth.tif", attenuation, photometric="minisblack", compression="zlib", predictor=False)
+        (out / "scan.json").write_text(json.dumps(document), encoding="utf-8")
+    except OSError as error:  # numpy says of a full disk how many bytes it wrote, and neither why nor where
+        raise ResultError(f"{out} cannot be written to: {error.strerror or error}; is the disk full?") from error
     return document
 
 

@@ -35,10 +35,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from splatcore.errors import Problem, ScanError
+    from splatcore.errors import OptionsError, Problem, ScanError
     from splatcore.machine import threads_allowed
     from splatcore.simulate import Simulation, load_volume, simulate
 
+    if args.threads is not None and not 1 <= args.threads <= 1024:
+        raise OptionsError(f"threads: got {args.threads}, expected 1 to 1024")
+    if args.out.exists() and not args.out.is_dir():
+        raise ScanError([Problem(str(args.out), "is a file, expected a folder", "choose another name")])
     if args.out.exists() and any(args.out.iterdir()) and not args.overwrite:
         raise ScanError([Problem(str(args.out), "is not empty", "choose another folder, or give --overwrite")])
     what = Simulation(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from splatcore.errors import ResultError
 from splatcore.geometry import circular, rotation_from_vector
 from splatcore.scan import check_scan, read_scan
 from splatcore.simulate import Simulation, add_noise, draw_motions, load_volume, simulate, true_frames
@@ -135,3 +136,10 @@ def test_small_files_keep_a_quarter_of_the_noise(tmp_path):
 def test_8_bit_volumes_are_shares_of_255(tmp_path):
     np.savez(tmp_path / "v.npz", volume=np.full((4, 4, 4), 255, np.uint8))
     assert load_volume(tmp_path / "v.npz").max() == 1.0
+
+
+def test_a_full_disk_is_named(tmp_path):
+    (tmp_path / "scan").mkdir()
+    (tmp_path / "scan" / "projections.tif").symlink_to("/dev/full")
+    with pytest.raises(ResultError, match=r"scan cannot be written to.*disk full"):
+        simulate(phantom(16), tmp_path / "scan", Simulation(views=2), threads=1)

@@ -67,6 +67,22 @@ def test_simulate_does_not_overwrite_silently(work):
     assert "not empty" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("views", 0), ("views", -3), ("det", 0), ("i0", 0), ("i0", "nan"), ("i0", 1e30), ("arc-deg", "nan"),
+     ("sigma-rot", -1), ("seed", -1), ("det", 10**6), ("threads", -1)],
+)  # fmt: skip
+def test_what_cannot_be_simulated_is_named(work, tmp_path, option, value):
+    done = splatct("simulate", "--volume", work / "cube.npz", "-o", tmp_path / "scan", f"--{option}", value, code=2)
+    assert f"{option.replace('-', '_')}: got" in done.stderr and "expected" in done.stderr
+    assert not (tmp_path / "scan").exists()
+
+
+def test_simulate_refuses_a_file_for_its_folder(work):
+    done = splatct("simulate", "--volume", work / "cube.npz", "-o", work / "cube.npz", code=2)
+    assert "expected a folder" in done.stderr
+
+
 def test_wrong_volume_is_named(work, tmp_path):
     (tmp_path / "junk.npz").write_bytes(b"nothing")
     done = splatct("simulate", "--volume", tmp_path / "junk.npz", "--out", tmp_path / "scan", code=2)
