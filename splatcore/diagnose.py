@@ -25,6 +25,7 @@ from splatcore.start import fdk, splats_from_volume
 _STEPS = 500
 _SPLATS = 8_000
 _HOLD_OUT_EVERY = 8
+_MOST_MISSED = 0.5  # share of the images' RMS; with more left over, residuals do not speak of the geometry
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ def diagnose(
     after = before
     if options.calibrate != "none":
         after = try_frames(here, corrected.binned(here.factor), held_out, options.seed, threads)
+    missed = float(np.sqrt((after.rms**2).mean() / max(float((here.images.astype(np.float64) ** 2).mean()), 1e-60)))
     omega, tau = corrections.vectors()
     rotation_rms = float(np.rad2deg(np.sqrt((omega**2).sum(axis=1).mean())))
     translation_rms = float(np.sqrt((tau**2).sum(axis=1).mean()))
@@ -91,16 +93,17 @@ def diagnose(
     return {
         "format": "splatct-report/1",
         "scan": scan.name,
-        "verdict": _verdict(options, before, after, rotation_rms, translation_rms),
+        "verdict": _verdict(options, before, after, missed, held_out, rotation_rms, translation_rms),
         "findings": [finding for finding in findings if finding],
         "views": _views(normals.rms, before, after, omega, tau, sigma, held_out),
-        "held_out": {"before": before.held_out_rms, "after": after.held_out_rms},
+        "held_out": {"before": before.held_out_rms, "after": after.held_out_rms} if held_out.any() else None,
         "summary": {
             "rotation_rms_deg": rotation_rms,
             "translation_rms_mm": translation_rms,
             "residual_rms": float(np.sqrt((normals.rms**2).mean())),
             "pose_share_before": float(np.median(before.share)),
             "pose_share_after": float(np.median(after.share)),
+            "unexplained_share": missed,
             "diagnosed_at_binning": here.factor,
             **{name: value for name, value in static.items()},
         },
@@ -134,8 +137,17 @@ def _improvement(before: Trial, after: Trial) -> float:
     return 1 - after.held_out_rms / max(before.held_out_rms, 1e-30)
 
 
-def _verdict(options: Options, before: Trial, after: Trial, rotation: float, translation: float) -> str:
+def _verdict(
+    options: Options, before: Trial, after: Trial, missed: float, held_out: Array, rotation: float, translation: float
+) -> str:
+    """missed: RMS of what the last trial leaves unexplained, as a share of the images' own RMS."""
     share = float(np.median(before.share))
+    if missed > _MOST_MISSED:
+        return (
+            f"The reconstruction does not explain the images: {missed:.0%} of their signal (RMS) is left over, so "
+            "nothing can be said about the geometry. Is the object inside the volume, and are kind, scale and "
+            "geometry those of this scan?"
+        )
     if options.calibrate == "none":
         if share > 0.1:
             return (
@@ -143,6 +155,12 @@ def _verdict(options: Options, before: Trial, after: Trial, rotation: float, tra
                 "reconstruction leaves unexplained. Reconstruct again with calibration."
             )
         return "The images agree with the given geometry as far as single views can tell; nothing was corrected."
+    if not held_out.any():
+        return (
+            f"With {len(held_out)} view{'s' if len(held_out) > 1 else ''} none can be left out, so nothing tells "
+            f"whether the corrected geometry is better than the given one; views were moved by {rotation:.2g} "
+            f"degrees and {translation:.2g} mm (RMS)."
+        )
     gain = _improvement(before, after)
     if gain > 0.05:
         found = (
@@ -186,7 +204,7 @@ def _geometry(
 
 
 def _held_out(options: Options, before: Trial, after: Trial, held_out: Array) -> dict[str, Any] | None:
-    if options.calibrate == "none":
+    if options.calibrate == "none" or not held_out.any():
         return None
     gain = _improvement(before, after)
     return {

@@ -19,7 +19,7 @@ import numpy as np
 
 from splatcore.descent import Descent, Rates
 from splatcore.diagnose import diagnose
-from splatcore.errors import ReconstructionError
+from splatcore.errors import OptionsError, ReconstructionError
 from splatcore.gauge import settle
 from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.options import Options
@@ -48,6 +48,7 @@ _FINEST = {"preview": 2, "normal": 1, "fine": 1}
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
 _REACH_PX = 1.5  # longest pose step, in pixels of the level
 _WORTH_THREADS = 4_000  # splats
+_FAINTEST = 1e-30  # line integral; single precision has no room for the squares of less
 _HUBER = 2.0  # standard deviations of the residual beyond which a pixel counts less for the poses
 
 # The prior where the scanner states no tolerance: degrees, and a share of the volume's half width.
@@ -85,7 +86,15 @@ def reconstruct(scan: Scan, options: Options | None = None) -> Generator[Progres
 
 
 def resolved(scan: Scan, options: Options) -> Options:
-    """Options with every default filled in: all the processor's threads, splats by the volume's size."""
+    """Options with every default filled in: all the processor's threads, splats by the volume's size.
+
+    Raises OptionsError where the detector cannot show what is to be calibrated.
+    """
+    if options.calibrate == "full" and min(scan.frames.rows, scan.frames.cols) < 2:
+        raise OptionsError(
+            f"calibrate: got full for a detector of {scan.frames.rows} x {scan.frames.cols} pixels, expected at least "
+            "2 x 2: a single line does not show how a view leaves its plane; use static or none"
+        )
     threads = options.threads or len(os.sched_getaffinity(0))
     edge = scan.volume.voxels ** (1 / 3)
     splats = options.splats or int(np.clip(30_000 * (edge / 128) ** 1.5, 2_000, 2_000_000))
@@ -142,10 +151,15 @@ class _Run:
     def level(self, here: Level) -> Generator[Progress, None, None]:
         """One resolution: from backprojection to refined splats and poses."""
         began, work = time.monotonic(), self._works[here.factor]
+        top = float(here.images.max())
+        if not top > _FAINTEST:
+            raise ReconstructionError(
+                f"the projections are empty: their largest line integral is {top:.3g} at binning {here.factor}, "
+                "expected an object that absorbs; check the sign, kind and scale of the projections"
+            )
         frames = self._corrected(here.nominal)
         volume = fdk(here.images, frames, here.grid, self._threads)
         splats = splats_from_volume(volume, here.grid, work.splats, self._rng)
-        top = float(here.images.max())
         # A level this small is done before a second thread is awake.
         threads = self._threads if len(splats) >= _WORTH_THREADS else 1
         descent = Descent(

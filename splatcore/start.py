@@ -11,6 +11,8 @@ from splatcore.geometry import Array, Frames
 from splatcore.grid import VolumeGrid
 from splatcore.splats import Floats, Splats, grid_array
 
+_SAME_ANGLE = np.deg2rad(1e-3)  # views closer than this stand at one angle
+
 
 def fdk(projections: Floats, frames: Frames, grid: VolumeGrid, threads: int, hann: float = 1.0) -> Floats:
     """Filtered backprojection after Feldkamp, Davis and Kress (1984), each view with its own frame.
@@ -34,7 +36,8 @@ def angular_weights(frames: Frames) -> Array:
     angle = np.arctan2(outward[:, 1], outward[:, 0])
     order = np.argsort(angle)
     gaps = np.diff(angle[order], append=angle[order[0]] + 2 * np.pi)
-    usual = float(np.median(gaps))
+    apart = gaps[gaps > _SAME_ANGLE]  # a scan of several turns sees every angle more than once
+    usual = float(np.median(apart if apart.size else gaps))
     gaps = np.where(gaps > 3 * usual, usual, gaps)
     weights = np.empty(len(angle))
     weights[order] = (gaps + np.roll(gaps, 1)) / 2

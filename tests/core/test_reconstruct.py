@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatcore.errors import ReconstructionError
+from splatcore.errors import OptionsError, ReconstructionError
 from splatcore.evaluate import evaluate
 from splatcore.gauge import align, pose_errors
 from splatcore.geometry import RigidMotions, circular
@@ -122,6 +122,45 @@ def test_empty_projections_are_refused(tmp_path):
     scan = scan_of(tmp_path, Simulation(views=12, det=64), edge=32)
     with pytest.raises(ReconstructionError, match="empty"):
         drain(reconstruct(replace(scan, projections=np.zeros_like(scan.projections))))
+
+
+def test_projections_below_zero_are_refused(tmp_path):
+    scan = scan_of(tmp_path, Simulation(views=12, det=64), edge=32)
+    for spoiled in (-scan.projections - 0.1, scan.projections * np.float32(1e-40)):
+        with pytest.raises(ReconstructionError, match=r"empty.*sign"):
+            drain(reconstruct(replace(scan, projections=spoiled), Options(quality="preview", threads=1)))
+
+
+def test_one_row_of_pixels_cannot_show_six_freedoms(tmp_path):
+    scan = scan_of(tmp_path, Simulation(views=12, det=48), edge=24)
+    line = replace(
+        scan,
+        projections=np.ascontiguousarray(scan.projections[:, 24:25]),
+        frames=replace(scan.frames, rows=1),
+        volume=replace(scan.volume, shape=(1, 24, 24)),
+    )
+    with pytest.raises(OptionsError, match=r"1 x 48.*static"):
+        drain(reconstruct(line, Options(quality="preview", threads=1)))
+    for calibrate in ("static", "none"):
+        result = drain(reconstruct(line, Options(calibrate=calibrate, quality="preview", threads=1)))
+        assert result.volume.max() > 0 and np.isfinite(result.volume).all()
+
+
+def test_no_verdict_on_the_geometry_without_views_to_hold_out(tmp_path):
+    scan = scan_of(tmp_path, Simulation(views=3, det=64, sigma_rot=0.02), edge=32)
+    report = drain(reconstruct(scan, Options(quality="preview", threads=1))).report
+    assert "none can be left out" in report["verdict"] and "better." not in report["verdict"]
+    assert report["held_out"] is None
+    assert "held-out views" not in [finding["name"] for finding in report["findings"]]
+
+
+@pytest.mark.parametrize("calibrate", ["full", "none"])
+def test_no_verdict_on_the_geometry_where_the_volume_misses_the_object(tmp_path, calibrate):
+    scan = scan_of(tmp_path, Simulation(views=12, det=64), edge=32)
+    away = replace(scan, volume=replace(scan.volume, voxel_mm=(0.01,) * 3))
+    report = drain(reconstruct(away, Options(calibrate=calibrate, quality="preview", threads=1))).report
+    assert "does not explain the images" in report["verdict"]
+    assert report["summary"]["unexplained_share"] > 0.5
 
 
 @pytest.mark.parametrize("views", [1, 2, 5])

@@ -304,6 +304,7 @@ def test_arc_and_gap(tmp_path: Path, angles: list[float], arc: float, gap: float
         (np.exp(-plain_images()), "line_integrals", "look like a transmission"),
         (3 * np.exp(-plain_images()), "transmission", "brighter than the open beam"),
         (np.where(np.arange(VIEWS)[:, None, None] == 4, 0, plain_images()), "line_integrals", "view 4: all pixels"),
+        (-plain_images() - 0.1, "line_integrals", "no line integral is above zero (at most -0.1)"),
         (np.roll(plain_images(), 7, axis=2), "line_integrals", "right (100% of views)"),
         (np.roll(plain_images(), -4, axis=1), "line_integrals", "cut off at the image edge: top (100% of views)"),
     ],

@@ -122,3 +122,10 @@ def test_the_same_seed_gives_the_same_splats() -> None:
 def test_an_empty_volume_is_refused() -> None:
     with pytest.raises(ReconstructionError, match="empty"):
         splats_from_volume(-np.ones(GRID.shape, np.float32), GRID, 100, np.random.default_rng(0))
+
+
+def test_three_turns_weigh_as_much_as_one() -> None:
+    """Most neighbours then stand at the same angle, or as near as an encoder can tell."""
+    angles = np.tile(np.arange(24) * 15.0, 3) + np.repeat([0, 1e-5, 2e-5], 24)
+    thrice = circular("cone", angles, 500, 700, ROWS, COLS, (4.0, 4.0))
+    assert angular_weights(thrice).sum() == pytest.approx(np.pi)
