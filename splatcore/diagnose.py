@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from splatcore.descent import Descent, Rates
+from splatcore.errors import ReconstructionError
 from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.options import Options
 from splatcore.poses import Normals, accumulate
@@ -42,7 +43,10 @@ def try_frames(here: Level, frames: Frames, held_out: Array, seed: int, threads:
     kept = np.flatnonzero(np.logical_not(held_out))
     rng = np.random.default_rng(seed)
     volume = fdk(here.images[kept], frames[kept], here.grid, threads)
-    splats = splats_from_volume(volume, here.grid, _SPLATS, rng)
+    try:
+        splats = splats_from_volume(volume, here.grid, _SPLATS, rng)
+    except ReconstructionError:  # these frames see nothing from these views; the reconstruction itself is made
+        return _blank(here, held_out)
     top = float(here.images.max())
     descent = Descent(
         splats, frames.rows, frames.cols, voxel_mm=here.voxel_mm, density_unit=float(np.percentile(volume, 99.9)),
@@ -57,6 +61,13 @@ def try_frames(here: Level, frames: Frames, held_out: Array, seed: int, threads:
     normals = accumulate(descent.renderer, descent.splats, frames, here.images, here.mask, 1e3 * top)
     pixels = np.maximum(normals.pixels[held_out].sum(), 1.0)
     return Trial(normals.rms, normals.explained(), float(np.sqrt(normals.residual_ss[held_out].sum() / pixels)))
+
+
+def _blank(here: Level, held_out: Array) -> Trial:
+    """The trial of a geometry that explains nothing: the images themselves are left over."""
+    squares = (here.images.astype(np.float64) ** 2).mean(axis=(1, 2))
+    left_out = squares[held_out] if held_out.any() else squares
+    return Trial(np.sqrt(squares), np.zeros(len(squares)), float(np.sqrt(left_out.mean())))
 
 
 def diagnose(

@@ -53,6 +53,7 @@ _HUBER = 2.0  # standard deviations of the residual beyond which a pixel counts 
 
 # The prior where the scanner states no tolerance: degrees, and a share of the volume's half width.
 _LOOSE_ROTATION_DEG, _LOOSE_TRANSLATION = 5.0, 0.1
+_TIGHTEST = 1e-6  # degrees or mm: a tolerance of zero says that nothing moves
 
 _GAUGE = (
     "world settled where the poses are nearest nominal: mean rotation zero; translation and, for a cone beam, "
@@ -125,8 +126,11 @@ class _Run:
         self._timings: dict[str, float] = {}
         half = float(scan.volume.half_extent_mm().max())
         stated = scan.tolerance
-        rotation_deg = stated.rotation_deg if stated and stated.rotation_deg else _LOOSE_ROTATION_DEG
-        translation = stated.translation_mm if stated and stated.translation_mm else _LOOSE_TRANSLATION * half
+        rotation_deg, translation = _LOOSE_ROTATION_DEG, _LOOSE_TRANSLATION * half
+        if stated and stated.rotation_deg is not None:
+            rotation_deg = max(stated.rotation_deg, _TIGHTEST)
+        if stated and stated.translation_mm is not None:
+            translation = max(stated.translation_mm, _TIGHTEST)
         self._prior = Prior(float(np.deg2rad(rotation_deg)), translation)
         self._radius = half
         self._offset = 0.0  # of the rotation axis along u, mm at the isocentre

@@ -17,7 +17,7 @@ from splatcore.options import Options
 from splatcore.reconstruct import drain, reconstruct
 from splatcore.reconstruction import Reconstruction
 from splatcore.results import write_results
-from splatcore.scan import Scan
+from splatcore.scan import Scan, Tolerance
 from splatcore.simulate import Simulation, add_noise, project
 
 from .phantom import phantom, scan_of
@@ -198,3 +198,22 @@ def test_parallel_beam(tmp_path):
     assert np.rad2deg(np.sqrt((omega**2).sum(axis=1).mean())) < 0.8  # 2.0 before, observed 0.50
     assert np.sqrt((tau**2).sum(axis=1).mean()) < 1.0  # 5.6 mm across the beam before
     assert np.isinf(result.sigma_translation_mm).any()
+
+
+def test_a_scan_whose_only_signal_is_held_out_still_gives_a_volume(tmp_path):
+    scan = scan_of(tmp_path, Simulation(views=24, det=64), edge=32)
+    images = np.zeros_like(scan.projections)
+    images[4::8] = scan.projections[4::8]  # just the views that the diagnosis leaves out
+    result = drain(
+        reconstruct(replace(scan, projections=images), Options(calibrate="none", quality="preview", threads=1))
+    )
+    assert np.isfinite(result.volume).all() and result.volume.max() > 0
+    assert result.report["summary"]["unexplained_share"] == pytest.approx(1)
+
+
+def test_a_stated_tolerance_of_zero_means_that_no_view_moves(tmp_path):
+    scan = scan_of(tmp_path, Simulation(views=24, det=64, sigma_rot=0.02), edge=32)
+    rigid = replace(scan, tolerance=Tolerance(rotation_deg=0.0, translation_mm=0.0))
+    result = drain(reconstruct(rigid, Options(quality="preview", threads=1)))
+    omega, tau = result.corrections.vectors()
+    assert np.abs(omega).max() < 1e-4 and np.abs(tau).max() < 1e-3
