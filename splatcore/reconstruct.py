@@ -10,7 +10,6 @@ the poses. After each sweep the freedoms that no projection shows are settled, a
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Generator
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from splatcore.diagnose import diagnose
 from splatcore.errors import OptionsError, ReconstructionError
 from splatcore.gauge import settle
 from splatcore.geometry import Array, Frames, RigidMotions
+from splatcore.machine import threads_allowed
 from splatcore.options import Options
 from splatcore.poses import (
     Normals,
@@ -87,7 +87,7 @@ def reconstruct(scan: Scan, options: Options | None = None) -> Generator[Progres
 
 
 def resolved(scan: Scan, options: Options) -> Options:
-    """Options with every default filled in: all the processor's threads, splats by the volume's size.
+    """Options with every default filled in: the threads this process may use, splats by the volume's size.
 
     Raises OptionsError where the detector cannot show what is to be calibrated.
     """
@@ -96,7 +96,7 @@ def resolved(scan: Scan, options: Options) -> Options:
             f"calibrate: got full for a detector of {scan.frames.rows} x {scan.frames.cols} pixels, expected at least "
             "2 x 2: a single line does not show how a view leaves its plane; use static or none"
         )
-    threads = options.threads or len(os.sched_getaffinity(0))
+    threads = options.threads or threads_allowed()
     edge = scan.volume.voxels ** (1 / 3)
     splats = options.splats or int(np.clip(30_000 * (edge / 128) ** 1.5, 2_000, 2_000_000))
     return replace(options, threads=threads, splats=splats)
