@@ -36,11 +36,11 @@ class Series:
 
 
 def number_text(value: float) -> str:
-    """Three significant digits, as a person writes them."""
+    """Three significant digits, four from a hundred on, as a person writes them."""
     if not math.isfinite(value):
         return "–"
     if value == 0 or 1e-3 <= abs(value) < 1e5:
-        text = f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+        text = f"{value:.{3 if abs(value) < 100 else 4}g}" if abs(value) < 1000 else f"{value:.0f}"
         return text.replace("-", "−")
     return f"{value:.2e}".replace("-", "−")
 

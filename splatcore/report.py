@@ -194,7 +194,7 @@ def _held_out(held_out: Any) -> str:
     if not isinstance(held_out, dict):
         return ""
     before, after = _number(held_out.get("before")), _number(held_out.get("after"))
-    text = "Views that took no part in the reconstruction are predicted from it: the fair judge of a correction."
+    text = "Views left out of a fresh reconstruction are predicted from it, with the poses that the full run found."
     if before is not None and after is not None and before > 0:
         change = (after - before) / before
         word = "less" if change < 0 else "more"

@@ -241,6 +241,6 @@ def test_ticks_are_few_and_cover_the_range(low: float, width: float) -> None:
 
 
 def test_numbers_are_short() -> None:
-    assert [number_text(n) for n in (0.0, 1234.6, -0.012345, 1e-5, 2.5e7, math.inf)] == [
-        "0", "1235", "−0.0123", "1.00e−05", "2.50e+07", "–",
+    assert [number_text(n) for n in (0.0, 1234.6, 127.44, -0.012345, 1e-5, 2.5e7, math.inf)] == [
+        "0", "1235", "127.4", "−0.0123", "1.00e−05", "2.50e+07", "–",
     ]  # fmt: skip
