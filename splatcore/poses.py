@@ -70,15 +70,18 @@ def accumulate(
     return Normals(hessian, gradient, *sums.T)
 
 
-def step_full(normals: Normals, motions: RigidMotions, prior: Prior, limit: Array) -> tuple[RigidMotions, Array]:
+def step_full(
+    normals: Normals, motions: RigidMotions, prior: Prior, limit: Array, caution: float = 1.0
+) -> tuple[RigidMotions, Array]:
     """New poses after one damped Gauss-Newton step, and the strain [3, 3] that the object's means must follow.
 
     Views and strain are solved jointly (Schur complement of the arrow-shaped system): a stretched object seen
     from slightly wrong angles and distances is nearly the same scan, and alternation alone takes hundreds of
     sweeps to find its way along that valley.
     limit [6]: no component of a view's step exceeds it (rad, mm); the whole step is shortened instead.
+    caution: how many pixels count as one independent measurement against the prior.
     """
-    noise = np.maximum(normals.weighted_ss / np.maximum(normals.pixels - 6, 1), 1e-20)
+    noise = caution * np.maximum(normals.weighted_ss / np.maximum(normals.pixels - 6, 1), 1e-20)
     precision = prior.precision()
     offset = np.concatenate(motions.vectors(), axis=1)
     hessian = normals.hessian / noise[:, None, None]

@@ -46,6 +46,9 @@ _STEPS = {8: 600, 4: 750, 2: 1200, 1: 2400}
 _QUALITY = {"preview": 1.0, "normal": 1.0, "fine": 1.5}
 _FINEST = {"preview": 2, "normal": 1, "fine": 1}
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
+# Above full resolution what residuals hold is mostly the model's own error, alike in thousands of pixels. Taken
+# for independent noise it drives a view of a nearly round object round its axis into a wrong minimum.
+_CAUTION = 1000.0
 _REACH_PX = 1.5  # longest pose step, in pixels of the level
 _WORTH_THREADS = 4_000  # splats
 _FAINTEST = 1e-30  # line integral; single precision has no room for the squares of less
@@ -226,7 +229,8 @@ class _Run:
         else:
             reach = _REACH_PX * here.pixel_at_isocentre_mm
             limit = np.array([reach / self._radius] * 3 + [3 * reach] * 3)
-            motions, strain = step_full(normals, before, self._prior, limit)
+            caution = 1.0 if here.factor == min(self._works) else _CAUTION
+            motions, strain = step_full(normals, before, self._prior, limit, caution)
             similarity, self._motions = settle(here.nominal, motions)
             stretched = (descent.splats.means @ (np.eye(3) + strain)).astype(np.float32)
             descent.replace(replace(descent.splats, means=stretched).moved(similarity))

@@ -59,6 +59,21 @@ def test_prior_holds_back_what_the_images_do_not_show():
     assert np.abs(tau).max() < 0.5 * 1.1e-3  # back to nominal, but for the damping of one thousandth
 
 
+def test_caution_yields_to_the_prior_only_where_the_images_say_little():
+    splats, frames, renderer, draw = scene()
+    images = draw(splats, frames)
+    noise = np.random.default_rng(6).normal(0, 0.02 * images.max(), images.shape).astype(np.float32)
+    ring = Splats(splats.means * np.float32([0, 0, 1]), np.full_like(splats.scales, 6.0), *splats.arrays()[2:])
+    round_images = draw(ring, frames)  # blobs on the axis: turning about z shows nothing
+    turned = RigidMotions.exp(np.tile([0.0, 0.0, 0.05], (10, 1)), np.tile([0.0, 0.0, 1.0], (10, 1)))
+    tight = Prior(0.05, 5.0, strain=1e-9)
+    normals = accumulate(renderer, ring, turned.correct(frames), round_images + noise, None, 1.0)
+    step, _ = step_full(normals, turned, tight, LIMIT, caution=1000.0)
+    omega, tau = step.vectors()
+    assert np.abs(omega[:, 2]).max() < 0.01  # back towards nominal: the images do not hold it
+    assert np.abs(tau[:, 2]).max() < 0.3  # the height is seen, and found
+
+
 def test_steps_are_limited():
     splats, frames, renderer, draw = scene()
     far = RigidMotions.exp(np.tile([0, 0, 0.3], (10, 1)), np.zeros((10, 3)))
