@@ -214,11 +214,3 @@ class RigidMotions:
             u=turn(nominal.u),
             v=turn(nominal.v),
         )
-
-
-def motions_between(nominal: Frames, corrected: Frames) -> RigidMotions:
-    """The motions that best turn nominal frames into corrected ones: orientation from the detector's
-    axes, position from the source (cone) or the detector centre (parallel)."""
-    rotation = np.einsum("vji,vjk->vik", nominal.axes(), corrected.axes())
-    here, there = nominal.origin(), corrected.origin()
-    return RigidMotions(rotation, here - np.einsum("vij,vj->vi", rotation, there))

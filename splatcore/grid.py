@@ -45,11 +45,6 @@ class VolumeGrid:
         zz, yy, xx = np.meshgrid(z, y, x, indexing="ij")
         return np.stack([xx, yy, zz], axis=-1)
 
-    def corners_mm(self) -> Array:
-        """The eight corners of the box, (x, y, z). [8, 3]"""
-        signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], np.float64)
-        return np.array(self.center_mm) + signs * self.half_extent_mm()
-
     def to_json(self) -> dict[str, Any]:
         return {"shape": list(self.shape), "voxel_mm": list(self.voxel_mm), "center_mm": list(self.center_mm)}
 

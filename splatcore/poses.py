@@ -32,6 +32,11 @@ class Normals:
         return np.sqrt(self.residual_ss / np.maximum(self.pixels, 1))
 
     @property
+    def noise(self) -> Array:
+        """Variance of a pixel's residual, six numbers fitted. [views]"""
+        return np.maximum(self.weighted_ss / np.maximum(self.pixels - 6, 1), 1e-20)
+
+    @property
     def rigid(self) -> Array:
         """The block of the view's own motion. [views, 6, 6]"""
         return self.hessian[:, :6, :6]
@@ -81,7 +86,7 @@ def step_full(
     limit [6]: no component of a view's step exceeds it (rad, mm); the whole step is shortened instead.
     caution: how many pixels count as one independent measurement against the prior.
     """
-    noise = caution * np.maximum(normals.weighted_ss / np.maximum(normals.pixels - 6, 1), 1e-20)
+    noise = caution * normals.noise
     precision = prior.precision()
     offset = np.concatenate(motions.vectors(), axis=1)
     hessian = normals.hessian / noise[:, None, None]
@@ -108,7 +113,7 @@ def step_static(normals: Normals, frames: Frames, offset_mm: float, prior: Prior
     """The centre of rotation after one Gauss-Newton step: how far the axis lies from nominal along u, in mm at the
     isocentre. All views share it; its derivative is that of the object shifted along u."""
     along = _along_u(frames)
-    noise = np.maximum(normals.weighted_ss / np.maximum(normals.pixels - 6, 1), 1e-20)
+    noise = normals.noise
     curvature = np.einsum("vi,vij,vj->v", along, normals.hessian[:, 3:6, 3:6], along) / noise
     slope = np.einsum("vi,vi->v", along, normals.gradient[:, 3:6]) / noise
     precision = 1 / prior.translation**2
@@ -140,7 +145,7 @@ def axis_column(corrected: Frames) -> float:
 
 def sigmas(normals: Normals, prior: Prior) -> tuple[Array, Array]:
     """One standard deviation of rotation [views, 3] rad and translation [views, 3] mm, the volume taken as known."""
-    noise = np.maximum(normals.weighted_ss / np.maximum(normals.pixels - 6, 1), 1e-20)
+    noise = normals.noise
     precision = normals.rigid / noise[:, None, None] + np.diag(prior.precision())
     deviation = np.sqrt(np.diagonal(np.linalg.inv(precision), axis1=1, axis2=2))
     return deviation[:, :3], deviation[:, 3:]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,10 +36,6 @@ class Level:
         """A detector pixel seen at the isocentre, the smaller of its sides, median over views."""
         step = np.minimum(np.linalg.norm(self.nominal.u, axis=1), np.linalg.norm(self.nominal.v, axis=1))
         return float(np.median(step * self.nominal.isocentre_depth()))
-
-    def views(self, chosen: np.ndarray) -> Level:
-        """The level with these views only."""
-        return replace(self, nominal=self.nominal[chosen], images=np.ascontiguousarray(self.images[chosen]))
 
 
 def factors(scan: Scan, finest: int) -> list[int]:

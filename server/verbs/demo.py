@@ -27,11 +27,15 @@ def run(args: argparse.Namespace) -> int:
     if read_header(args.scan).simulation is None:  # before anything is started
         raise ScanError([Problem(str(args.scan), "carries no truth", "the demo needs a simulated scan")])
     data, results = args.out / "service", args.out / "results"
+    log_file = args.out / "service.log"
+    if args.out.exists() and not log_file.exists() and any(args.out.iterdir()):
+        hint = "choose another folder with -o; the demo makes its folder anew and deletes only its own"
+        raise ScanError([Problem(str(args.out), "holds something that is not an earlier demo's", hint)])
     for folder in (data, results):
         if folder.exists():
             shutil.rmtree(folder)
     data.mkdir(parents=True)
-    with (args.out / "service.log").open("w", encoding="utf-8") as log:
+    with log_file.open("w", encoding="utf-8") as log:
         service = subprocess.Popen(_splatct("up", "--data", str(data)), stdout=subprocess.PIPE, stderr=log, text=True)
         try:
             return _show(service, args, results)
