@@ -65,6 +65,7 @@ class _Renderer:
         v_scales: Real,
         v_quats: Real,
         v_density: Real,
+        v_motion: Double | None = None,  # [6] as in render_vjp
     ) -> float: ...
     def motion_normal(
         self,

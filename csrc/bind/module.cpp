@@ -144,18 +144,20 @@ void bind(nb::module_& m, const char* renderer_name) {
           "loss_vjp",
           [](R& self, Frame frame, bool cone, Rows3<T> means, Rows3<T> scales, Rows4<T> quats, In1<T> density,
              In2<T> target, MaybeImage<T> mask, double huber_delta, double dssim, double data_range, OutRows3<T> v_means,
-             OutRows3<T> v_scales, OutRows4<T> v_quats, Out1<T> v_density) {
+             OutRows3<T> v_scales, OutRows4<T> v_quats, Out1<T> v_density, std::optional<Motion> v_motion) {
             const auto splats = splats_in<T>(means, scales, quats, density);
             const auto out = splats_out<T>(splats.count, v_means, v_scales, v_quats, v_density);
             require(huber_delta > 0, "huber_delta must be positive");
             const T *want = self.image(target), *on = self.maybe(mask);
             const auto f = frame_in(frame, cone);
             nb::gil_scoped_release release;
-            return (*self).loss_vjp(f, splats, want, on, huber_delta, dssim, data_range, out);
+            return (*self).loss_vjp(f, splats, want, on, huber_delta, dssim, data_range, out,
+                                    v_motion ? v_motion->data() : nullptr);
           },
           "frame"_a.noconvert(), "cone"_a, "means"_a.noconvert(), "scales"_a.noconvert(), "quats"_a.noconvert(),
           "density"_a.noconvert(), "target"_a.noconvert(), "mask"_a.noconvert().none(), "huber_delta"_a, "dssim"_a,
-          "data_range"_a, "v_means"_a.noconvert(), "v_scales"_a.noconvert(), "v_quats"_a.noconvert(), "v_density"_a.noconvert())
+          "data_range"_a, "v_means"_a.noconvert(), "v_scales"_a.noconvert(), "v_quats"_a.noconvert(), "v_density"_a.noconvert(),
+          "v_motion"_a.noconvert().none() = nb::none())
       .def(
           "motion_normal",
           [](R& self, Frame frame, bool cone, Rows3<T> means, Rows3<T> scales, Rows4<T> quats, In1<T> density,

@@ -47,11 +47,11 @@ class CpuRenderer final : public Renderer<T> {
   }
 
   double loss_vjp(const FrameIn& frame, const SplatsIn<T>& splats, const T* target, const T* mask, double huber_delta,
-                  double dssim, double data_range, const SplatsOut<T>& v) override {
+                  double dssim, double data_range, const SplatsOut<T>& v, double* v_motion) override {
     draw(frame, splats);
     double loss = huber_loss(target, mask, T(huber_delta), 1 - dssim);
     if (dssim > 0) loss += dssim_loss(target, mask, dssim, data_range);
-    gather(frame, splats, v, nullptr);
+    gather(frame, splats, v, v_motion);
     return loss;
   }
 
