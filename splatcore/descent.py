@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatcore import _native
 from splatcore.geometry import Array
@@ -39,15 +40,17 @@ class Descent:
         dssim: float,
         data_range: float,
         threads: int,
+        scale_limits: tuple[float, float] | None = None,
     ) -> None:
+        """scale_limits: the smallest and largest standard deviation, mm; 0.15 and 20 voxels where left out."""
         self.renderer = _native.Renderer32(rows, cols, threads)
-        self._limits = (0.15 * voxel_mm, 20 * voxel_mm)
+        self._limits = scale_limits or (0.15 * voxel_mm, 20 * voxel_mm)
         self._unit, self._steps, self._rates, self._voxel = density_unit, max(steps, 1), rates, voxel_mm
         self._huber, self._dssim, self._range, self._threads = huber, dssim, data_range, threads
         self._count = 0
         self._first = np.zeros(11 * len(splats), np.float32)
         self._second = np.zeros(11 * len(splats), np.float32)
-        self._gradient = splats.zeros_like()
+        self.gradient = splats.zeros_like()  # dL/dsplats of the last `differentiate`
         self.replace(splats)
 
     def replace(self, splats: Splats) -> None:
@@ -59,12 +62,41 @@ class Descent:
             np.float32
         )
 
+    def repopulate(self, splats: Splats, parent: NDArray[np.intp]) -> None:
+        """Go on from a changed population. parent [len(splats)]: the present row whose moments a splat keeps; -1 for
+        a new one, whose moments are zero."""
+        kept = parent >= 0
+        old, new = len(self.splats), len(splats)
+        for name in ("_first", "_second"):
+            before, after = getattr(self, name), np.zeros(11 * new, np.float32)
+            start = 0
+            for width in (3, 3, 4, 1):  # as the core lays them out: means, scales, quats, density
+                rows = before[start * old : (start + width) * old].reshape(old, width)
+                after[start * new : (start + width) * new].reshape(new, width)[kept] = rows[parent[kept]]
+                start += width
+            setattr(self, name, after)
+        self.gradient = splats.zeros_like()
+        self.replace(splats)
+
     def step(self, frame: Array, cone: bool, target: Floats, mask: Floats | None) -> float:
         """One Adam step on one view. Returns the loss before it."""
-        s, g = self.splats, self._gradient
+        loss = self.differentiate(frame, cone, target, mask)
+        self.update()
+        return loss
+
+    def differentiate(
+        self, frame: Array, cone: bool, target: Floats, mask: Floats | None, v_motion: Array | None = None
+    ) -> float:
+        """The loss of one view. Overwrites `gradient`, and v_motion [6] (omega rad, tau mm), with its derivatives."""
         loss: float = self.renderer.loss_vjp(
-            frame, cone, *s.arrays(), target, mask, self._huber, self._dssim, self._range, *g.arrays()
-        )
+            frame, cone, *self.splats.arrays(), target, mask, self._huber, self._dssim, self._range,
+            *self.gradient.arrays(), v_motion,
+        )  # fmt: skip
+        return loss
+
+    def update(self) -> None:
+        """One Adam step along `gradient`."""
+        s, g = self.splats, self.gradient
         decay = self._rates.end ** (self._count / self._steps)
         self._count += 1
         _native.adam(
@@ -72,4 +104,3 @@ class Descent:
             self._rates.mean * self._voxel * decay, self._rates.log_scale * decay, self._rates.quat * decay,
             self._rates.density * decay, *self._limits, self._unit, self._count, self._threads,
         )  # fmt: skip
-        return loss
