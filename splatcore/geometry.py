@@ -168,6 +168,13 @@ def vector_from_rotation(matrix: Array) -> Array:
     return quat[..., 1:] * scale
 
 
+def quaternion_from_rotation(matrix: Array) -> Array:
+    """The unit quaternion w x y z, w not negative, of a rotation matrix. [3, 3] -> [4]"""
+    vector = vector_from_rotation(matrix)
+    half = float(np.linalg.norm(vector)) / 2
+    return np.concatenate([[np.cos(half)], 0.5 * np.sinc(half / np.pi) * vector])
+
+
 @dataclass(frozen=True)
 class RigidMotions:
     """x -> rotation x + translation, one for each view."""

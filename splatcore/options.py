@@ -14,6 +14,7 @@ from splatcore.errors import OptionsError
 
 Calibrate = Literal["full", "static", "none"]
 Quality = Literal["preview", "normal", "fine"]
+Method = Literal["splatct", "r2", "paper"]
 
 
 def _knob(default: Any, help: str, low: float | None = None, high: float | None = None) -> Any:
@@ -30,12 +31,17 @@ class Options:
     )  # fmt: skip
     quality: Quality = _knob("normal", "preview stops at half resolution; fine runs longer")
     splats: int | None = _knob(None, "Gaussians at full resolution; default: chosen from the volume", 100, 5_000_000)
+    method: Method = _knob(
+        "splatct", "splatct: this engine's own; r2: R2-Gaussian, which trusts the geometry; paper: Choi et al. 2026, "
+        "R2-Gaussian with an increment of every pose moved by Adam. Both to compare with: slower and less exact"
+    )  # fmt: skip
+    steps: int | None = _knob(None, "Adam steps of method r2 or paper; default 30000", 1, 10_000_000)
     dssim: float = _knob(0.0, "weight of the D-SSIM term of the loss beside L1", 0.0, 1.0)
     seed: int = _knob(0, "seed of every random choice", 0, 2**31 - 1)
     threads: int | None = _knob(None, "CPU threads; default: all this process may use", 1, 1024)
 
     def __post_init__(self) -> None:
-        for name, kind in (("calibrate", Calibrate), ("quality", Quality)):
+        for name, kind in (("calibrate", Calibrate), ("quality", Quality), ("method", Method)):
             if getattr(self, name) not in get_args(kind):
                 raise OptionsError(f"{name}: got {getattr(self, name)!r}, expected one of {', '.join(get_args(kind))}")
         for knob in dataclasses.fields(self):
@@ -47,6 +53,9 @@ class Options:
                 raise OptionsError(f"{knob.name}: got {value!r}, expected a {'whole ' if whole else ''}number")
             if not (math.isfinite(value) and low <= value <= high):
                 raise OptionsError(f"{knob.name}: got {value}, expected {low} to {high}")
+
+        if self.method == "splatct" and self.steps is not None:
+            raise OptionsError(f"steps: got {self.steps} with method splatct, expected it with r2 or paper alone")
 
     @classmethod
     def from_dict(cls, given: dict[str, Any]) -> Options:
@@ -63,7 +72,11 @@ class Options:
 
 def describe() -> list[dict[str, Any]]:
     """Each knob as a plain dict (name, default, choices, low, high, help), for forms and docs."""
-    choices = {"calibrate": list(get_args(Calibrate)), "quality": list(get_args(Quality))}
+    choices = {
+        "calibrate": list(get_args(Calibrate)),
+        "quality": list(get_args(Quality)),
+        "method": list(get_args(Method)),
+    }
     return [
         {"name": k.name, "default": k.default, "choices": choices.get(k.name), **k.metadata}
         for k in dataclasses.fields(Options)

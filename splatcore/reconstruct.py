@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from splatcore import r2
 from splatcore.descent import Descent, Rates
 from splatcore.diagnose import diagnose
 from splatcore.errors import OptionsError, ReconstructionError
@@ -79,6 +80,8 @@ def reconstruct(scan: Scan, options: Options | None = None) -> Generator[Progres
 
     Raises ReconstructionError where the projections hold nothing to reconstruct.
     """
+    if options is not None and options.method != "splatct":
+        return (yield from r2.reconstruct(scan, options))
     options = resolved(scan, options or Options())
     run = _Run(scan, options)
     yield run.progress("start", f"{len(scan.frames)} views of {scan.frames.rows} x {scan.frames.cols}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splatcore.geometry import Array, vector_from_rotation
+from splatcore.geometry import Array, quaternion_from_rotation
 from splatcore.grid import VolumeGrid
 
 Floats = NDArray[np.float32]
@@ -48,7 +48,7 @@ class Splats:
             self,
             means=means.astype(np.float32),
             scales=(self.scales * similarity.scale).astype(np.float32),
-            quats=_multiply(_quaternion(turn), self.quats.astype(np.float64)).astype(np.float32),
+            quats=_multiply(quaternion_from_rotation(turn), self.quats.astype(np.float64)).astype(np.float32),
             density=(self.density / similarity.scale).astype(np.float32),
         )
 
@@ -65,12 +65,6 @@ class Similarity:
 def grid_array(grid: VolumeGrid) -> Array:
     """[2, 3]: voxel [z, y, x] mm, centre [x, y, z] mm, as the core takes it."""
     return np.array([grid.voxel_mm, grid.center_mm], np.float64)
-
-
-def _quaternion(rotation: Array) -> Array:
-    vector = vector_from_rotation(rotation)
-    angle = float(np.linalg.norm(vector))
-    return np.concatenate([[np.cos(angle / 2)], 0.5 * np.sinc(angle / (2 * np.pi)) * vector])
 
 
 def _multiply(left: Array, right: Array) -> Array:

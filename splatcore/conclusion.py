@@ -1,0 +1,63 @@
+"""From splats and poses to a Reconstruction: voxels, the scanner's static part, the diagnosis."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from splatcore.diagnose import diagnose
+from splatcore.geometry import Array, Frames, RigidMotions
+from splatcore.options import Options
+from splatcore.poses import Normals, axis_column, split_static
+from splatcore.reconstruction import Reconstruction
+from splatcore.scan import Scan
+from splatcore.splats import Splats
+
+
+def conclude(
+    scan: Scan,
+    options: Options,
+    splats: Splats,
+    corrected: Frames,
+    motions: RigidMotions,
+    normals: Normals,
+    sigma: tuple[Array, Array],
+    gauge: str,
+    timings: dict[str, float],
+    began: float,
+) -> Reconstruction:
+    """The result of a run, whatever its method.
+
+    options: resolved. motions: every view's own, `corrected` has the static part in it as well. normals: at the
+    final poses and full resolution. sigma: of omega [views, 3] rad and tau [views, 3] mm. timings: seconds by stage,
+    to which voxelize, diagnose and total are added; began: of the run, on time.monotonic's clock.
+    """
+    assert options.threads is not None
+    start = time.monotonic()
+    volume = splats.voxelize(scan.volume, options.threads)
+    timings["voxelize"] = time.monotonic() - start
+    # What all views share along u is the scanner's; as a motion of the object it shows in every frame.
+    _, corrections = split_static(scan.frames, motions)
+    static = {"cor_px": axis_column(corrected)}
+    start = time.monotonic()
+    report = diagnose(scan, options, corrected, corrections, static, normals, sigma, options.threads)
+    timings["diagnose"] = time.monotonic() - start
+    timings["total"] = time.monotonic() - began
+    return Reconstruction(
+        scan_name=scan.name,
+        splats=splats,
+        volume=volume,
+        grid=scan.volume,
+        nominal=scan.frames,
+        corrected=corrected,
+        corrections=corrections,
+        sigma_rotation_deg=np.rad2deg(sigma[0]),
+        sigma_translation_mm=sigma[1],
+        residual_rms=normals.rms,
+        static=static,
+        gauge=gauge,
+        report=report,
+        options=options,
+        timings=timings,
+    )

@@ -1,0 +1,217 @@
+"""The methods that this engine is measured against, with its own kernels: R2-Gaussian and the paper.
+
+R2-Gaussian (Zha et al., NeurIPS 2024): one resolution, splats drawn from FDK, L1 + 0.25 D-SSIM + 0.05 TV, adaptive
+control of their number, poses taken as true. The paper (Choi et al., CVPR 2026): the same without TV, every view's
+quaternion and translation moved by Adam from the first step on. Constants are theirs, in the units of
+`splatcore.scene`. Known differences: splats start at voxel centres, not at corners; log scales are bounded by
+clipping in place of a sigmoid; footprints end at four standard deviations.
+
+    drain(reconstruct(scan, Options(method="paper")))
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from splatcore import _native
+from splatcore.conclusion import conclude
+from splatcore.densify import Rules, ScreenGradient, densify
+from splatcore.descent import Descent, Rates
+from splatcore.errors import OptionsError, ReconstructionError
+from splatcore.geometry import Array, RigidMotions
+from splatcore.increments import Increments
+from splatcore.machine import threads_allowed
+from splatcore.options import Options
+from splatcore.poses import Prior, accumulate, sigmas
+from splatcore.progress import Progress
+from splatcore.reconstruction import Reconstruction
+from splatcore.scan import Scan
+from splatcore.scene import Scene, scene_of
+from splatcore.splats import Splats
+from splatcore.variation import Variation
+
+STEPS, SPLATS = 30_000, 50_000
+_OCCUPIED = 0.05  # density above which a voxel may hold a splat
+_START_DENSITY = 0.15  # of the voxel's
+_RATES = Rates(mean=2e-4, log_scale=5e-3, quat=1e-3, density=1e-2, end=0.1)
+_SCALES = (0.001, 1.0)  # smallest and largest standard deviation
+_SSIM, _TV = 0.25, 0.05  # weights of 1 - SSIM and of the total variation beside L1
+_DENSIFY_FROM, _DENSIFY_EVERY, _DENSIFY_UNTIL = 500, 100, 0.5  # steps; the last a share of all
+# The core's loss is (1 - d) L1 + d (1 - SSIM) / 2: with this d it is R2-Gaussian's times _WEIGHT.
+_DSSIM = 2 * _SSIM / (1 + 2 * _SSIM)
+_WEIGHT = 1 - _DSSIM
+_CORNER = 1e-6  # of the Huber function, so small that it is L1
+
+
+@dataclass(frozen=True)
+class Switches:
+    """What is varied in ablations. None: as the method has it."""
+
+    variation: bool | None = None  # the TV term
+    moving: bool | None = None  # poses
+    covariance_path: bool = True  # the part of the pose gradient that goes through the splats' covariance
+    densify: bool = True
+    pose_rate: float = 1.0  # times the paper's; 30,000 / steps gives a shorter run the same reach
+    unit: float | None = None  # 1/mm: the attenuation that counts as 1, where it is known
+
+
+def resolved(scan: Scan, options: Options) -> Options:
+    """Options with every default filled in.
+
+    Raises OptionsError where the method cannot do what is asked of it.
+    """
+    if options.method == "r2":  # knows no calibration, and `full` is only the default
+        options = replace(options, calibrate="none")
+    elif options.calibrate == "static":
+        raise OptionsError("calibrate: got static with method paper, expected full or none: it moves single views")
+    return replace(
+        options,
+        threads=options.threads or threads_allowed(),
+        splats=options.splats or SPLATS,
+        steps=options.steps or STEPS,
+    )
+
+
+def reconstruct(
+    scan: Scan, options: Options, switches: Switches | None = None
+) -> Generator[Progress, None, Reconstruction]:
+    """Reconstruct by `options.method`, r2 or paper. Yields Progress, returns the Reconstruction.
+
+    Raises OptionsError, and ReconstructionError where the projections hold nothing to reconstruct.
+    """
+    run = _Run(scan, resolved(scan, options), switches or Switches())
+    yield run.progress("start", f"{len(scan.frames)} views of {scan.frames.rows} x {scan.frames.cols}")
+    yield from run.optimise()
+    yield run.progress("diagnose", "compare nominal and corrected geometry")
+    result = run.finish()
+    yield run.progress("done", result.report["verdict"])
+    return result
+
+
+class _Run:
+    """One reconstruction under way."""
+
+    def __init__(self, scan: Scan, options: Options, switches: Switches) -> None:
+        assert options.threads is not None and options.splats is not None and options.steps is not None
+        self._scan, self._options, self._switches = scan, options, switches
+        self._threads, self._steps = options.threads, options.steps
+        self._began = time.monotonic()
+        self._fraction = 0.0
+        self._rng = np.random.default_rng(options.seed)
+        self._scene = scene_of(scan, self._threads, switches.unit)
+        scene = self._scene
+        paper = options.method == "paper"
+        moving = options.calibrate == "full" if switches.moving is None else switches.moving
+        self._poses = Increments(scene.frames, self._steps, switches.pose_rate) if moving else None
+        vary = not paper if switches.variation is None else switches.variation
+        self._variation = Variation(scene.grid, _WEIGHT * _TV, self._threads) if vary else None
+        splats = first_splats(scene, options.splats, self._rng)
+        self._descent = Descent(
+            splats, scan.frames.rows, scan.frames.cols, voxel_mm=1.0, density_unit=1.0, steps=self._steps,
+            rates=_RATES, huber=_CORNER, dssim=_DSSIM, data_range=1.0, threads=self._threads, scale_limits=_SCALES,
+        )  # fmt: skip
+
+    def progress(self, stage: str, message: str, **facts: object) -> Progress:
+        return Progress(stage, self._fraction, message, time.monotonic() - self._began, **facts)  # type: ignore[arg-type]
+
+    def optimise(self) -> Generator[Progress, None, None]:
+        """All Adam steps, one view each, with adaptive control in the first half."""
+        scene, descent, rules = self._scene, self._descent, Rules()
+        packed, cone, views = scene.frames.packed(), scene.frames.beam == "cone", len(scene.frames)
+        rows, cols = scene.frames.rows, scene.frames.cols
+        until = int(_DENSIFY_UNTIL * self._steps) if self._switches.densify else 0
+        screen = ScreenGradient(len(descent.splats), rows, cols, cone)
+        v_motion = np.zeros(6)
+        order: list[int] = []
+        loss, drawn = 0.0, 0
+        for step in range(1, self._steps + 1):
+            order = order or list(self._rng.permutation(views))
+            view = order.pop()
+            frame = packed[view] if self._poses is None else self._poses.frame(view)
+            loss += descent.differentiate(
+                frame, cone, scene.images[view], scene.mask, None if self._poses is None else v_motion
+            )
+            drawn += 1
+            if step < until:
+                screen.add(frame, descent.splats.means, descent.gradient.means)
+            if self._poses is not None:
+                self._poses.step(view, self._pose_gradient(v_motion), step - 1)
+            if self._variation is not None:
+                self._variation.add_gradient(descent.splats, descent.gradient, self._rng)
+            descent.update()
+            if _DENSIFY_FROM < step < until and step % _DENSIFY_EVERY == 0:
+                if len(descent.splats) < rules.most:
+                    hard = screen.mean() / np.float32(_WEIGHT)
+                    descent.repopulate(*densify(descent.splats, hard, rules, scene.grid, self._rng))
+                screen = ScreenGradient(len(descent.splats), rows, cols, cone)
+            if order and step < self._steps:
+                continue
+            if not (np.isfinite(loss) and len(descent.splats)):
+                raise ReconstructionError(
+                    f"the loss became {loss} with {len(descent.splats)} splats left at step {step}; try another method"
+                )
+            self._fraction = 0.9 * step / self._steps
+            yield self.progress(
+                "level", f"step {step} of {self._steps}", level=1, step=step, splats=len(descent.splats),
+                loss=loss / drawn * scene.unit * scene.length_mm,
+            )  # fmt: skip
+            loss, drawn = 0.0, 0
+
+    def _pose_gradient(self, v_motion: Array) -> Array:
+        """dL/d(omega, tau), or the part of it that goes through the splats' means."""
+        if self._switches.covariance_path:
+            return v_motion
+        moment = self._descent.splats.means.T @ self._descent.gradient.means  # sum of x_i g_j
+        torque = moment - moment.T
+        return np.array([torque[1, 2], torque[2, 0], torque[0, 1], *v_motion[3:]], np.float64)
+
+    def finish(self) -> Reconstruction:
+        """The result in mm, with its report."""
+        scan, scene = self._scan, self._scene
+        timings = {"binning_1": time.monotonic() - self._began}
+        splats = scene.splats_mm(self._descent.splats)
+        motions = RigidMotions.identity(len(scan.frames))
+        if self._poses is not None:
+            motions = scene.motions_mm(self._poses.motions())
+        corrected = motions.correct(scan.frames)
+        renderer = _native.Renderer32(scan.frames.rows, scan.frames.cols, self._threads)
+        top = float(scan.projections.max())
+        normals = accumulate(renderer, splats, corrected, scan.projections, scene.mask, top)
+        nothing = np.zeros((len(corrected), 3))
+        sigma = (nothing, nothing)
+        if self._poses is not None:
+            # Neither method states any; these are what the images say, with a prior as wide as the volume.
+            sigma = sigmas(normals, Prior(1.0, scene.length_mm))
+        gauge = "nominal world kept" if self._poses is None else "not settled: poses and splats move freely"
+        result = conclude(scan, self._options, splats, corrected, motions, normals, sigma, gauge, timings, self._began)
+        self._fraction = 1.0
+        return result
+
+
+def first_splats(scene: Scene, count: int, rng: np.random.Generator) -> Splats:
+    """Up to `count` splats at voxels drawn from those that are not empty, as wide as their three nearest neighbours
+    are far (root mean square), with a share of the voxel's density."""
+    occupied = np.flatnonzero(scene.volume > _OCCUPIED)
+    if len(occupied) < 4:
+        raise ReconstructionError(
+            f"the first backprojection has {len(occupied)} voxels that are not empty, expected an object inside the "
+            "volume; check the geometry, and the sign and kind of the projections"
+        )
+    chosen = np.sort(rng.choice(occupied, min(count, len(occupied)), replace=False))
+    k, j, i = np.unravel_index(chosen, scene.grid.shape)
+    x, y, z = scene.grid.axes_mm()
+    means = np.stack([x[i], y[j], z[k]], axis=1)
+    distance, _ = cKDTree(means).query(means, k=4)
+    width = np.clip(np.sqrt((distance[:, 1:] ** 2).mean(axis=1)), *_SCALES)
+    n = len(chosen)
+    return Splats(
+        means=means.astype(np.float32),
+        scales=np.repeat(width[:, None], 3, axis=1).astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+        density=(_START_DENSITY * scene.volume.ravel()[chosen]).astype(np.float32),
+    )
