@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from splatcore import _native
 from splatcore.geometry import Array
+from splatcore.planar import Plane
 from splatcore.splats import Floats, Splats
 
 
@@ -41,12 +42,15 @@ class Descent:
         data_range: float,
         threads: int,
         scale_limits: tuple[float, float] | None = None,
+        plane: Plane | None = None,
     ) -> None:
-        """scale_limits: the smallest and largest standard deviation, mm; 0.15 and 20 voxels where left out."""
+        """scale_limits: the smallest and largest standard deviation, mm; 0.15 and 20 voxels where left out.
+        plane: where all splats stay, of a line detector."""
         self.renderer = _native.Renderer32(rows, cols, threads)
         self._limits = scale_limits or (0.15 * voxel_mm, 20 * voxel_mm)
         self._unit, self._steps, self._rates, self._voxel = density_unit, max(steps, 1), rates, voxel_mm
         self._huber, self._dssim, self._range, self._threads = huber, dssim, data_range, threads
+        self._plane = plane
         self._count = 0
         self._first = np.zeros(11 * len(splats), np.float32)
         self._second = np.zeros(11 * len(splats), np.float32)
@@ -104,3 +108,5 @@ class Descent:
             self._rates.mean * self._voxel * decay, self._rates.log_scale * decay, self._rates.quat * decay,
             self._rates.density * decay, *self._limits, self._unit, self._count, self._threads,
         )  # fmt: skip
+        if self._plane:
+            self._plane.flatten(s.means)

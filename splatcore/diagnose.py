@@ -18,6 +18,7 @@ from splatcore.descent import Descent, Rates
 from splatcore.errors import ReconstructionError
 from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.options import Options
+from splatcore.planar import common_plane
 from splatcore.poses import Normals, accumulate
 from splatcore.pyramid import Level, factors, level
 from splatcore.scan import Scan
@@ -51,6 +52,7 @@ def try_frames(here: Level, frames: Frames, held_out: Array, seed: int, threads:
     descent = Descent(
         splats, frames.rows, frames.cols, voxel_mm=here.voxel_mm, density_unit=float(np.percentile(volume, 99.9)),
         steps=_STEPS, rates=Rates(), huber=1e-4 * top, dssim=0.0, data_range=top, threads=threads,
+        plane=common_plane(frames),
     )  # fmt: skip
     packed = frames.packed()
     for step in range(_STEPS):
@@ -87,7 +89,7 @@ def diagnose(
     before = try_frames(here, here.nominal, held_out, options.seed, threads)
     after = before
     if options.calibrate != "none":
-        after = try_frames(here, corrected.binned(here.factor), held_out, options.seed, threads)
+        after = try_frames(here, here.binned(corrected), held_out, options.seed, threads)
     missed = float(np.sqrt((after.rms**2).mean() / max(float((here.images.astype(np.float64) ** 2).mean()), 1e-60)))
     omega, tau = corrections.vectors()
     rotation_rms = float(np.rad2deg(np.sqrt((omega**2).sum(axis=1).mean())))

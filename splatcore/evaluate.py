@@ -67,7 +67,7 @@ def _pose_scores(true: Frames, estimated: Frames, grid: VolumeGrid) -> dict[str,
     distance = np.linalg.norm(true.project(lattice) - estimated.project(lattice), axis=2)
     return {
         "rot_deg": float(np.rad2deg(np.sqrt((omega**2).sum(axis=1).mean()))),
-        "trans_vox": float(np.sqrt((tau**2).sum(axis=1).mean()) / np.prod(grid.voxel_mm) ** (1 / 3)),
+        "trans_vox": float(np.sqrt((tau**2).sum(axis=1).mean()) / grid.edge_mm),
         "rpe_px": float(np.sqrt((distance**2).mean())),
     }
 

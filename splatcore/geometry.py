@@ -49,16 +49,29 @@ class Frames:
             v=self.v[views],
         )
 
-    def binned(self, factor: int) -> Frames:
-        """The frames of images whose pixels are means of factor x factor blocks.
+    @property
+    def line(self) -> bool:
+        """Whether the detector is one line of pixels, so that a view sees one plane of the object: a fan beam."""
+        return min(self.rows, self.cols) == 1 < max(self.rows, self.cols)
+
+    def plane_normals(self) -> Array:
+        """Unit normals of the planes that the views of a line detector see. [views, 3]"""
+        along = self.u if self.rows == 1 else self.v
+        ray = self.detector_center - self.source if self.beam == "cone" else self.source
+        normal = np.cross(along, ray)
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+    def binned(self, down: int, across: int | None = None) -> Frames:
+        """The frames of images whose pixels are means of blocks of `down` rows by `across` columns (default: as many).
 
         Trailing rows and columns that fill no block are dropped, so the centre may move.
         """
-        rows, cols = self.rows // factor, self.cols // factor
-        shift_c = (cols * factor - self.cols) / 2
-        shift_r = (rows * factor - self.rows) / 2
+        across = down if across is None else across
+        rows, cols = self.rows // down, self.cols // across
+        shift_c = (cols * across - self.cols) / 2
+        shift_r = (rows * down - self.rows) / 2
         center = self.detector_center + shift_c * self.u + shift_r * self.v
-        return replace(self, detector_center=center, u=self.u * factor, v=self.v * factor, rows=rows, cols=cols)
+        return replace(self, detector_center=center, u=self.u * across, v=self.v * down, rows=rows, cols=cols)
 
     def axes(self) -> Array:
         """Orthonormal detector axes as rows: along u, along v made square to u, their cross product. [views, 3, 3]"""

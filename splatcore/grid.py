@@ -27,6 +27,12 @@ class VolumeGrid:
     def voxels(self) -> int:
         return math.prod(self.shape)
 
+    @property
+    def edge_mm(self) -> float:
+        """Edge of a cube as large as a voxel; of a grid that is one voxel thick, of a square."""
+        steps = [step for n, step in zip(self.shape, self.voxel_mm, strict=True) if n > 1] or list(self.voxel_mm)
+        return float(math.prod(steps) ** (1 / len(steps)))
+
     def half_extent_mm(self) -> Array:
         """Half the volume's width along x, y, z. [3]"""
         return np.array([n * step / 2 for n, step in zip(self.shape[::-1], self.voxel_mm[::-1], strict=True)])

@@ -13,6 +13,7 @@ import numpy as np
 
 from splatcore import _native
 from splatcore.geometry import Array, Frames, RigidMotions
+from splatcore.planar import in_plane
 from splatcore.splats import Floats, Splats
 
 
@@ -64,7 +65,8 @@ class Prior:
 def accumulate(
     renderer: _native.Renderer32, splats: Splats, frames: Frames, targets: Floats, mask: Floats | None, huber: float
 ) -> Normals:
-    """The normal equations of all views."""
+    """The normal equations of all views. A line detector shows motion in its own plane alone; what would leave the
+    plane is taken out of them, so that poses and strain stay in it."""
     views = len(frames)
     hessian, gradient, sums = np.zeros((views, 12, 12)), np.zeros((views, 12)), np.zeros((views, 4))
     packed = frames.packed()
@@ -72,6 +74,9 @@ def accumulate(
         sums[k] = renderer.motion_normal(
             packed[k], frames.beam == "cone", *splats.arrays(), targets[k], mask, huber, hessian[k], gradient[k]
         )
+    if frames.line:
+        free = in_plane(frames)
+        hessian, gradient = free @ hessian @ free, np.einsum("vij,vj->vi", free, gradient)
     return Normals(hessian, gradient, *sums.T)
 
 

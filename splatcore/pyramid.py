@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from splatcore.grid import VolumeGrid
 from splatcore.scan import Scan
 from splatcore.splats import Floats
 
-_FEWEST_PIXELS = 24  # a level whose detector is smaller than this tells nothing
+_FEWEST_PIXELS = 24  # a side of a level's detector that is shorter than this is no longer binned
 _FACTORS = (8, 4, 2, 1)
 
 
@@ -21,6 +20,7 @@ class Level:
     """One resolution of a scan."""
 
     factor: int
+    binning: tuple[int, int]  # rows, columns in a block: the factor, or less along a short side
     nominal: Frames
     images: Floats  # [views, rows, cols]
     mask: Floats | None  # [rows, cols] share of good pixels, None where all are good
@@ -28,39 +28,63 @@ class Level:
 
     @property
     def voxel_mm(self) -> float:
-        """Edge of a cube as large as the grid's voxel."""
-        return math.prod(self.grid.voxel_mm) ** (1 / 3)
+        """Edge of a cube (one slice of voxels: of a square) as large as the grid's voxel."""
+        return self.grid.edge_mm
 
     @property
     def pixel_at_isocentre_mm(self) -> float:
         """A detector pixel seen at the isocentre, the smaller of its sides, median over views."""
         step = np.minimum(np.linalg.norm(self.nominal.u, axis=1), np.linalg.norm(self.nominal.v, axis=1))
+        if self.nominal.line:  # the side across the line is not seen
+            step = np.linalg.norm(self.nominal.u if self.nominal.rows == 1 else self.nominal.v, axis=1)
         return float(np.median(step * self.nominal.isocentre_depth()))
+
+    def binned(self, frames: Frames) -> Frames:
+        """Frames of the whole detector as this level's images have them."""
+        return frames.binned(*self.binning)
 
 
 def factors(scan: Scan, finest: int) -> list[int]:
-    """Binning factors from coarse to `finest`, leaving out those too coarse for this detector."""
-    least = min(scan.frames.rows, scan.frames.cols)
-    usable = [f for f in _FACTORS if f >= finest and least // f >= _FEWEST_PIXELS]
+    """Binning factors from coarse to `finest`, leaving out those too coarse for this detector's longer side."""
+    most = max(scan.frames.rows, scan.frames.cols)
+    usable = [f for f in _FACTORS if f >= finest and most // f >= _FEWEST_PIXELS]
     return usable or [1]
 
 
 def level(scan: Scan, factor: int) -> Level:
-    """The scan binned by `factor`, on a grid whose voxels are as many times larger."""
-    frames, grid = scan.frames.binned(factor), scan.volume
-    mask = None if scan.bad_pixels is None else _bin((~scan.bad_pixels).astype(np.float32)[None], factor)[0]
+    """The scan binned by `factor`, on a grid whose voxels are as many times larger. A detector's short side, a few
+    rows or a single one, is binned by less, so that no less than 24 pixels are left where there were as many."""
+    binning = (_factor_of(scan.frames.rows, factor), _factor_of(scan.frames.cols, factor))
+    grid, good = scan.volume, None if scan.bad_pixels is None else (~scan.bad_pixels).astype(np.float32)
+    down = tuple(1 if n == 1 else factor for n in grid.shape)  # a single slice stays as thick as it is
     coarse = VolumeGrid(
-        (-(-grid.shape[0] // factor), -(-grid.shape[1] // factor), -(-grid.shape[2] // factor)),
-        (grid.voxel_mm[0] * factor, grid.voxel_mm[1] * factor, grid.voxel_mm[2] * factor),
+        (-(-grid.shape[0] // down[0]), -(-grid.shape[1] // down[1]), -(-grid.shape[2] // down[2])),
+        (grid.voxel_mm[0] * down[0], grid.voxel_mm[1] * down[1], grid.voxel_mm[2] * down[2]),
         grid.center_mm,
     )
-    return Level(factor, frames, _bin(scan.projections, factor), mask, coarse)
+    mask = None if good is None else _bin(good[None], binning)[0]
+    return Level(factor, binning, scan.frames.binned(*binning), _bin(scan.projections, binning, good), mask, coarse)
 
 
-def _bin(images: Floats, factor: int) -> Floats:
-    """Means of factor x factor blocks; rows and columns that fill no block are dropped."""
-    if factor == 1:
+def _factor_of(side: int, factor: int) -> int:
+    """The largest factor up to `factor` that leaves 24 pixels of a side, or 1."""
+    return next(f for f in _FACTORS if f == 1 or (f <= factor and side // f >= _FEWEST_PIXELS))
+
+
+def _bin(images: Floats, binning: tuple[int, int], good: Floats | None = None) -> Floats:
+    """Means of blocks, of their good pixels where there are any; rows and columns that fill no block are dropped."""
+    down, across = binning
+    if binning == (1, 1):
         return np.ascontiguousarray(images, np.float32)
-    views, rows, cols = images.shape[0], images.shape[1] // factor, images.shape[2] // factor
-    cut = images[:, : rows * factor, : cols * factor]
-    return np.ascontiguousarray(cut.reshape(views, rows, factor, cols, factor).mean(axis=(2, 4)), np.float32)
+    views, rows, cols = images.shape[0], images.shape[1] // down, images.shape[2] // across
+    cut = images[:, : rows * down, : cols * across].reshape(views, rows, down, cols, across)
+    means = np.ascontiguousarray(cut.mean(axis=(2, 4)), np.float32)
+    if good is None or good.all():
+        return means
+    weight = good[: rows * down, : cols * across].reshape(rows, down, cols, across)
+    # Only blocks with a bad pixel in them: the others keep the bits that they have without a mask.
+    r, c = np.nonzero((weight.min(axis=(1, 3)) < 1) & (weight.max(axis=(1, 3)) > 0))
+    blocks = weight[r, :, c]  # [blocks, down, across]
+    sums = np.einsum("bvij,bij->vb", cut[:, r, :, c], blocks)
+    means[:, r, c] = sums / blocks.sum(axis=(1, 2))
+    return means

@@ -24,6 +24,7 @@ from splatcore.gauge import settle
 from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.machine import threads_allowed
 from splatcore.options import Options
+from splatcore.planar import common_plane, unseen
 from splatcore.poses import (
     Normals,
     Prior,
@@ -97,10 +98,10 @@ def resolved(scan: Scan, options: Options) -> Options:
 
     Raises OptionsError where the detector cannot show what is to be calibrated.
     """
-    if options.calibrate == "full" and min(scan.frames.rows, scan.frames.cols) < 2:
+    if options.calibrate == "full" and scan.frames.rows * scan.frames.cols < 2:
         raise OptionsError(
-            f"calibrate: got full for a detector of {scan.frames.rows} x {scan.frames.cols} pixels, expected at least "
-            "2 x 2: a single line does not show how a view leaves its plane; use static or none"
+            "calibrate: got full for a detector of 1 x 1 pixels, expected at least two: a single ray does not show how "
+            "a view moves; use none"
         )
     threads = options.threads or threads_allowed()
     edge = scan.volume.voxels ** (1 / 3)
@@ -176,6 +177,7 @@ class _Run:
             splats, here.nominal.rows, here.nominal.cols, voxel_mm=here.voxel_mm,
             density_unit=float(np.percentile(volume, 99.9)), steps=work.steps, rates=Rates(), huber=1e-4 * top,
             dssim=self._options.dssim, data_range=top, threads=threads,
+            plane=common_plane(frames),
         )  # fmt: skip
         yield self.progress(
             "level", f"binning {here.factor}: {len(splats)} splats", level=here.factor, splats=len(splats)
@@ -290,4 +292,6 @@ class _Run:
         if corrected.beam == "parallel":
             # A shift along the ray changes nothing, so any component that shares in it is unbounded.
             tau = np.where(np.abs(self._scan.frames.source) > 1e-3, np.inf, tau)
+        if corrected.line:  # likewise out of the plane
+            omega[unseen(corrected)[0]] = tau[unseen(corrected)[1]] = np.inf
         return omega, tau

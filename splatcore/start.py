@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import fft, ndimage
 
@@ -9,45 +11,42 @@ from splatcore import _native
 from splatcore.errors import ReconstructionError
 from splatcore.geometry import Array, Frames
 from splatcore.grid import VolumeGrid
+from splatcore.redundancy import ray_weights
 from splatcore.splats import Floats, Splats, grid_array
 
-_SAME_ANGLE = np.deg2rad(1e-3)  # views closer than this stand at one angle
+_SHARE_OF_END = 50  # the level at the end of a row is the mean over this part of it
 
 
 def fdk(projections: Floats, frames: Frames, grid: VolumeGrid, threads: int, hann: float = 1.0) -> Floats:
     """Filtered backprojection after Feldkamp, Davis and Kress (1984), each view with its own frame.
 
-    projections [views, rows, cols]; hann: cut-off of the window on the ramp, as a share of Nyquist
-    (0: no window). Returns [z, y, x] 1/mm. Views are weighted by the angle each stands for.
+    projections [views, rows, cols], bad pixels filled; hann: cut-off of the window on the ramp, as a share of
+    Nyquist (0: no window). Returns [z, y, x] 1/mm. Views count by the angle they stand for, rays by how often they
+    are seen (splatcore.redundancy); rows that end inside the object are continued beyond the detector.
     """
+    frames, projections = _rows_across_axis(frames, projections)
     volume = np.zeros(grid.shape, np.float32)
     box, packed = grid_array(grid), frames.packed()
-    weights = angular_weights(frames)
+    weights = ray_weights(frames)
     for k in range(len(frames)):
-        filtered = _filter(projections[k], frames[k : k + 1], hann, threads)
-        _native.backproject(packed[k], frames.beam == "cone", box, filtered, float(weights[k]), volume, threads)
+        filtered = _filter(projections[k], frames[k : k + 1], weights[k], hann, threads)
+        if frames.rows == 1:  # rounding alone lifts a voxel off the only row; the same row on either side catches it
+            filtered = np.repeat(filtered, 3, axis=0)
+        _native.backproject(packed[k], frames.beam == "cone", box, filtered, 1.0, volume, threads)
     return volume
 
 
-def angular_weights(frames: Frames) -> Array:
-    """Half the angle to the two neighbours on the orbit, in radians, times 1/2 for the circle's two-fold
-    cover: sum pi over a full circle. Gaps beyond three times the median are the ends of a short scan. [views]"""
-    outward = frames.source if frames.beam == "cone" else -frames.source
-    angle = np.arctan2(outward[:, 1], outward[:, 0])
-    order = np.argsort(angle)
-    gaps = np.diff(angle[order], append=angle[order[0]] + 2 * np.pi)
-    apart = gaps[gaps > _SAME_ANGLE]  # a scan of several turns sees every angle more than once
-    usual = float(np.median(apart if apart.size else gaps))
-    gaps = np.where(gaps > 3 * usual, usual, gaps)
-    weights = np.empty(len(angle))
-    weights[order] = (gaps + np.roll(gaps, 1)) / 2
-    covered = float(gaps.sum())
-    # A full circle sees every ray twice; an arc near a half circle sees it about once.
-    return weights * (0.5 if covered > 1.5 * np.pi else np.pi / max(covered, 1e-9))
+def _rows_across_axis(frames: Frames, projections: Floats) -> tuple[Frames, Floats]:
+    """The views with their rows across the rotation axis, which the ramp must run across: transposed if need be."""
+    along_z = [np.abs(step[:, 2]) / np.linalg.norm(step, axis=1) for step in (frames.u, frames.v)]
+    if np.median(along_z[0]) <= np.median(along_z[1]):
+        return frames, projections
+    turned = replace(frames, u=frames.v, v=frames.u, rows=frames.cols, cols=frames.rows)
+    return turned, np.ascontiguousarray(projections.transpose(0, 2, 1))
 
 
-def _filter(image: Floats, frame: Frames, hann: float, threads: int) -> Floats:
-    """Cosine weight and ramp along the rows, in units such that plain backprojection gives 1/mm."""
+def _filter(image: Floats, frame: Frames, weights: Array, hann: float, threads: int) -> Floats:
+    """Cosine and redundancy weights and the ramp along rows, in units such that plain backprojection gives 1/mm."""
     rows, cols = image.shape
     pitch = float(np.linalg.norm(frame.u))
     if frame.beam == "cone":
@@ -57,17 +56,29 @@ def _filter(image: Floats, frame: Frames, hann: float, threads: int) -> Floats:
         normal = np.cross(frame.u[0], frame.v[0])
         normal /= np.linalg.norm(normal)
         depth = abs(float(normal @ (frame.detector_center[0] - frame.source[0])))
-        image = image * (depth / np.linalg.norm(away, axis=2)).astype(np.float32)
+        weights = weights * depth / np.linalg.norm(away, axis=2)
         # The pitch on a detector moved to the isocentre.
         pitch *= abs(float(normal @ frame.source[0])) / depth
-    length = fft.next_fast_len(2 * cols, real=True)
+    margin = cols // 4
+    length = fft.next_fast_len(2 * (cols + margin), real=True)
     response = _ramp(length, pitch)
     if hann > 0:
         frequency = np.arange(len(response)) / (length / 2) / hann
         response = np.where(frequency < 1, response * (0.5 + 0.5 * np.cos(np.pi * frequency)), 0)
-    spectrum = fft.rfft(image, length, axis=1, workers=threads)
+    continued = _continued(image * weights.astype(np.float32), margin)
+    spectrum = fft.rfft(continued, length, axis=1, workers=threads)
     filtered = fft.irfft(spectrum * response.astype(np.float32), length, axis=1, workers=threads)
-    return np.ascontiguousarray(filtered[:, :cols], np.float32)
+    return np.ascontiguousarray(filtered[:, margin : margin + cols], np.float32)
+
+
+def _continued(image: Floats, margin: int) -> Floats:
+    """Rows continued by `margin` columns on either side, falling from the level at their ends to zero as cos^2: a
+    row cut off inside the object would come out of the ramp with a bright rim. [rows, cols + 2 margin]"""
+    cols = image.shape[1]
+    end = max(1, min(cols, cols // _SHARE_OF_END))
+    fall = np.cos(np.pi / 2 * np.arange(1, margin + 1) / (margin + 1)).astype(np.float32) ** 2
+    left, right = (np.maximum(part.mean(axis=1, keepdims=True), 0) for part in (image[:, :end], image[:, -end:]))
+    return np.concatenate([left * fall[::-1], image, right * fall], axis=1)
 
 
 def _ramp(length: int, pitch: float) -> Array:
@@ -83,7 +94,7 @@ def _ramp(length: int, pitch: float) -> Array:
 def splats_from_volume(
     volume: Floats, grid: VolumeGrid, count: int, rng: np.random.Generator, threshold: float = 0.05
 ) -> Splats:
-    """About `count` isotropic splats on a body-centred lattice wherever the volume is not empty.
+    """About `count` splats, round in voxels, on a body-centred lattice wherever the volume is not empty.
 
     threshold: empty is below this share of the volume's 99.9th percentile. The lattice is as fine as it
     can be within `count`, but no finer than the voxels; positions are jittered by a tenth of its pitch.
@@ -96,28 +107,31 @@ def splats_from_volume(
         )
     level = threshold * top
     occupied = int(np.count_nonzero(volume > level))
-    pitch = (2 * occupied / count) ** (1 / 3)  # voxels; two points a cell
+    spread = np.array(volume.shape) > 1  # the axes along which there is a lattice; a single slice has one layer
+    dimensions = max(int(spread.sum()), 1)
+    finest = 2 ** (1 / dimensions)
+    pitch = (2 * occupied / count) ** (1 / dimensions)  # voxels; two points a cell
     for _ in range(8):
-        pitch = max(pitch, 2 ** (1 / 3))
+        pitch = max(pitch, finest)
         points, values = _lattice(volume, pitch, level)
-        if 0.97 * count <= len(points) <= count or (len(points) < count and pitch <= 2 ** (1 / 3)):
+        if 0.97 * count <= len(points) <= count or (len(points) < count and pitch <= finest):
             break
-        pitch *= (len(points) / (0.985 * count)) ** (1 / 3)
+        pitch *= (len(points) / (0.985 * count)) ** (1 / dimensions)
     if len(points) > count:
         keep = np.sort(rng.choice(len(points), count, replace=False))
         points, values = points[keep], values[keep]
-    points = points + rng.uniform(-0.1, 0.1, points.shape) * pitch
-    spacing = pitch / 2 ** (1 / 3)  # edge of the cube that each splat stands for, voxels
-    voxel = float(np.prod(grid.voxel_mm)) ** (1 / 3)
+    points = points + rng.uniform(-0.1, 0.1, points.shape) * pitch * spread
+    spacing = pitch / finest  # edge of the cube that each splat stands for, voxels
     sigma = 0.55 * spacing
-    sharpness = spacing**3 / ((2 * np.pi) ** 1.5 * sigma**3)  # so that overlapping splats add up to the volume
+    sharpness = (spacing / (np.sqrt(2 * np.pi) * sigma)) ** dimensions  # overlapping splats add up to the volume
+    voxel = np.where(spread, grid.voxel_mm, grid.edge_mm)
     middle = (np.array(grid.shape) - 1) / 2
     zyx = (points - middle) * np.array(grid.voxel_mm)
     means = zyx[:, ::-1] + np.array(grid.center_mm)
     n = len(points)
     return Splats(
         means=np.ascontiguousarray(means, np.float32),
-        scales=np.full((n, 3), sigma * voxel, np.float32),
+        scales=np.tile((sigma * voxel[::-1]).astype(np.float32), (n, 1)),
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         density=(values * sharpness).astype(np.float32),
     )
@@ -127,7 +141,7 @@ def _lattice(volume: Floats, pitch: float, level: float) -> tuple[Array, Array]:
     """Points (z, y, x in voxel indices) of a body-centred lattice where the volume exceeds `level`, and its values."""
     found = []
     for shift in (0.25, 0.75):
-        axes = [np.arange(shift * pitch - 0.5, n - 0.5, pitch) for n in volume.shape]
+        axes = [np.arange(shift * pitch - 0.5, n - 0.5, pitch) if n > 1 else np.zeros(1) for n in volume.shape]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         values = ndimage.map_coordinates(volume, points.T, order=1, mode="nearest")
         keep = values > level
