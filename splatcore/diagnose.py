@@ -22,7 +22,7 @@ from splatcore.planar import common_plane
 from splatcore.poses import Normals, accumulate
 from splatcore.pyramid import Level, factors, level
 from splatcore.scan import Scan
-from splatcore.start import fdk, splats_from_volume
+from splatcore.start import first_splats
 
 _STEPS = 500
 _SPLATS = 8_000
@@ -43,14 +43,13 @@ def try_frames(here: Level, frames: Frames, held_out: Array, seed: int, threads:
     """A short reconstruction with fixed frames from the views that are not held out, and its residuals."""
     kept = np.flatnonzero(np.logical_not(held_out))
     rng = np.random.default_rng(seed)
-    volume = fdk(here.images[kept], frames[kept], here.grid, threads)
     try:
-        splats = splats_from_volume(volume, here.grid, _SPLATS, rng)
+        splats, unit = first_splats(here.images[kept], frames[kept], here.grid, _SPLATS, rng, threads)
     except ReconstructionError:  # these frames see nothing from these views; the reconstruction itself is made
         return _blank(here, held_out)
     top = float(here.images.max())
     descent = Descent(
-        splats, frames.rows, frames.cols, voxel_mm=here.voxel_mm, density_unit=float(np.percentile(volume, 99.9)),
+        splats, frames.rows, frames.cols, voxel_mm=here.voxel_mm, density_unit=unit,
         steps=_STEPS, rates=Rates(), huber=1e-4 * top, dssim=0.0, data_range=top, threads=threads,
         plane=common_plane(frames),
     )  # fmt: skip

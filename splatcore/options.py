@@ -37,6 +37,7 @@ class Options:
     )  # fmt: skip
     steps: int | None = _knob(None, "Adam steps of method r2 or paper; default 30000", 1, 10_000_000)
     dssim: float = _knob(0.0, "weight of the D-SSIM term of the loss beside L1", 0.0, 1.0)
+    exposure: bool = _knob(True, "correct each view's line integrals for the drift of its exposure")
     seed: int = _knob(0, "seed of every random choice", 0, 2**31 - 1)
     threads: int | None = _knob(None, "CPU threads; default: all this process may use", 1, 1024)
 
@@ -44,6 +45,8 @@ class Options:
         for name, kind in (("calibrate", Calibrate), ("quality", Quality), ("method", Method)):
             if getattr(self, name) not in get_args(kind):
                 raise OptionsError(f"{name}: got {getattr(self, name)!r}, expected one of {', '.join(get_args(kind))}")
+        if not isinstance(self.exposure, bool):
+            raise OptionsError(f"exposure: got {self.exposure!r}, expected true or false")
         for knob in dataclasses.fields(self):
             value, low, high = getattr(self, knob.name), knob.metadata["low"], knob.metadata["high"]
             if low is None or value is None:
@@ -86,6 +89,9 @@ def describe() -> list[dict[str, Any]]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Every knob as a command-line option; left out means its default."""
     for knob in describe():
+        if isinstance(knob["default"], bool):
+            parser.add_argument(f"--{knob['name']}", action=argparse.BooleanOptionalAction, help=knob["help"])
+            continue
         kind = str if knob["choices"] else (float if isinstance(knob["default"], float) else int)
         parser.add_argument(f"--{knob['name']}", type=kind, choices=knob["choices"], help=knob["help"])
 

@@ -20,6 +20,7 @@ from splatcore import r2
 from splatcore.descent import Descent, Rates
 from splatcore.diagnose import diagnose
 from splatcore.errors import OptionsError, ReconstructionError
+from splatcore.exposure import Exposure, finding
 from splatcore.gauge import settle
 from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.machine import threads_allowed
@@ -41,7 +42,7 @@ from splatcore.pyramid import Level, factors, level
 from splatcore.reconstruction import Reconstruction
 from splatcore.scan import Scan
 from splatcore.splats import Splats
-from splatcore.start import fdk, splats_from_volume
+from splatcore.start import first_splats
 
 # Adam steps at each binning factor. Coarse steps cost a hundredth of fine ones.
 _STEPS = {8: 600, 4: 750, 2: 1200, 1: 2400}
@@ -144,6 +145,7 @@ class _Run:
         self._motions = RigidMotions.identity(len(scan.frames))
         self._splats: Splats | None = None
         self._normals: Normals | None = None
+        self._exposure = Exposure(len(scan.frames))
         self._deviation = 0.0  # robust residual, line-integral units, from the last sweep
         self._works: dict[int, _Work] = {}
         self._done = 0.0
@@ -162,6 +164,9 @@ class _Run:
     def level(self, here: Level) -> Generator[Progress, None, None]:
         """One resolution: from backprojection to refined splats and poses."""
         began, work = time.monotonic(), self._works[here.factor]
+        measured, here = here.images, replace(here, images=self._exposure.corrected(here.images))
+        # A mean over pixels gains nothing from the finest ones.
+        drifting = self._options.exposure and (here.factor > min(self._works) or len(self._works) == 1)
         top = float(here.images.max())
         if not top > _FAINTEST:
             raise ReconstructionError(
@@ -169,13 +174,12 @@ class _Run:
                 "expected an object that absorbs; check the sign, kind and scale of the projections"
             )
         frames = self._corrected(here.nominal)
-        volume = fdk(here.images, frames, here.grid, self._threads)
-        splats = splats_from_volume(volume, here.grid, work.splats, self._rng)
+        splats, unit = first_splats(here.images, frames, here.grid, work.splats, self._rng, self._threads)
         # A level this small is done before a second thread is awake.
         threads = self._threads if len(splats) >= _WORTH_THREADS else 1
         descent = Descent(
             splats, here.nominal.rows, here.nominal.cols, voxel_mm=here.voxel_mm,
-            density_unit=float(np.percentile(volume, 99.9)), steps=work.steps, rates=Rates(), huber=1e-4 * top,
+            density_unit=unit, steps=work.steps, rates=Rates(), huber=1e-4 * top,
             dssim=self._options.dssim, data_range=top, threads=threads,
             plane=common_plane(frames),
         )  # fmt: skip
@@ -201,6 +205,10 @@ class _Run:
             if self._options.calibrate != "none" and step >= first_sweep:
                 moved = self._sweep(here, descent)
                 packed = self._corrected(here.nominal).packed()
+            if drifting and step >= first_sweep:
+                corrected = self._corrected(here.nominal)
+                self._exposure.update(descent.renderer, descent.splats, corrected, measured, here.mask)
+                here = replace(here, images=self._exposure.corrected(measured))
             yield self.progress(
                 "poses" if moved else "level", f"binning {here.factor}, step {step} of {work.steps}", level=here.factor,
                 step=step, loss=loss / (views - len(order)), splats=len(splats), **moved,
@@ -249,6 +257,7 @@ class _Run:
         """Voxels, uncertainties and the report."""
         assert self._splats is not None and self._normals is not None
         scan, options, began = self._scan, self._options, time.monotonic()
+        scan = replace(scan, projections=self._exposure.corrected(scan.projections))
         corrected = self._corrected(scan.frames)
         volume = self._splats.voxelize(scan.volume, self._threads)
         self._timings["voxelize"] = time.monotonic() - began
@@ -261,6 +270,8 @@ class _Run:
         report = diagnose(
             scan, options, corrected, corrections, static, self._normals, (sigma_omega, sigma_tau), self._threads
         )
+        if options.exposure:
+            report["findings"].append(finding(self._exposure.offset))
         self._timings["diagnose"] = time.monotonic() - began
         self._timings["total"] = time.monotonic() - self._began
         self._fraction = 1.0

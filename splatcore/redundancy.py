@@ -14,10 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatcore.geometry import Array, Frames
+from splatcore.grid import VolumeGrid
 
 _SAME_ANGLE = np.deg2rad(1e-3)  # views closer than this stand at one angle
 # The widest gap between neighbouring views is the end of a short scan if it exceeds both, else a hole in a full turn.
 _OPEN, _OPEN_STEPS = np.deg2rad(20.0), 3.0  # rad, times the usual step
+_POINTS = 32  # an axis, at which coverage is looked up
 _STEPS_OF_TAPER = 3.0  # between views, at the ends of a scan that overlaps itself by less
 
 
@@ -79,6 +81,22 @@ def ray_weights(frames: Frames) -> Array:
     there = turn.confidence(opposite) * _on_detector(-distance, low[other], high[other])
     share = np.where(here > 0, here / np.maximum(here + there, 1e-12), 0.0)
     return turn.step[:, None] * share * max(1.0, np.pi / turn.arc)
+
+
+def coverage(frames: Frames, grid: VolumeGrid) -> Array:
+    """The share of all directions across the axis from which each voxel is seen: the ray weights through it, summed
+    over views, over pi. Looked up on at most 32 points an axis. [z, y, x]"""
+    weights = np.pad(ray_weights(frames), ((0, 0), (1, 1)))
+    z, y, x = (np.unique(np.linspace(0, n - 1, min(n, _POINTS)).round().astype(int)) for n in grid.shape)
+    points = grid.centers_mm()[np.ix_(z, y, x)]
+    total = np.zeros(points.shape[:3])
+    for k in range(len(frames)):
+        column = frames[k : k + 1].project(points.reshape(-1, 3))[0, :, 0].reshape(total.shape)
+        total += weights[k, np.clip(np.round(column), -1, frames.cols).astype(int) + 1]
+    for axis, (n, at) in enumerate(zip(grid.shape, (z, y, x), strict=True)):
+        middle = (at[1:] + at[:-1]) / 2
+        total = np.take(total, np.searchsorted(middle, np.arange(n)), axis=axis)
+    return total / np.pi
 
 
 def _midplane_rays(frames: Frames) -> tuple[Array, Array]:

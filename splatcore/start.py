@@ -11,10 +11,13 @@ from splatcore import _native
 from splatcore.errors import ReconstructionError
 from splatcore.geometry import Array, Frames
 from splatcore.grid import VolumeGrid
-from splatcore.redundancy import ray_weights
+from splatcore.redundancy import coverage, ray_weights
 from splatcore.splats import Floats, Splats, grid_array
 
 _SHARE_OF_END = 50  # the level at the end of a row is the mean over this part of it
+_ABOVE_AIR, _ENOUGH = 0.05, 0.02  # of the largest line integral; share of a row's end that must exceed it
+_COUNTS = 0.1  # of a view's largest ray weight
+_SEEN = 0.9  # of all directions
 
 
 def fdk(projections: Floats, frames: Frames, grid: VolumeGrid, threads: int, hann: float = 1.0) -> Floats:
@@ -59,16 +62,16 @@ def _filter(image: Floats, frame: Frames, weights: Array, hann: float, threads: 
         weights = weights * depth / np.linalg.norm(away, axis=2)
         # The pitch on a detector moved to the isocentre.
         pitch *= abs(float(normal @ frame.source[0])) / depth
-    margin = cols // 4
-    length = fft.next_fast_len(2 * (cols + margin), real=True)
+    beyond = cols // 4
+    length = fft.next_fast_len(2 * (cols + beyond), real=True)
     response = _ramp(length, pitch)
     if hann > 0:
         frequency = np.arange(len(response)) / (length / 2) / hann
         response = np.where(frequency < 1, response * (0.5 + 0.5 * np.cos(np.pi * frequency)), 0)
-    continued = _continued(image * weights.astype(np.float32), margin)
+    continued = _continued(image * weights.astype(np.float32), beyond)
     spectrum = fft.rfft(continued, length, axis=1, workers=threads)
     filtered = fft.irfft(spectrum * response.astype(np.float32), length, axis=1, workers=threads)
-    return np.ascontiguousarray(filtered[:, margin : margin + cols], np.float32)
+    return np.ascontiguousarray(filtered[:, beyond : beyond + cols], np.float32)
 
 
 def _continued(image: Floats, margin: int) -> Floats:
@@ -89,6 +92,33 @@ def _ramp(length: int, pitch: float) -> Array:
     odd = n % 2 == 1
     kernel[odd] = -1 / (np.pi**2 * n[odd].astype(np.float64) ** 2 * pitch)
     return np.real(np.fft.rfft(kernel))
+
+
+def first_splats(
+    images: Floats, frames: Frames, grid: VolumeGrid, count: int, rng: np.random.Generator, threads: int
+) -> tuple[Splats, float]:
+    """(about `count` splats of an FDK volume, the density 1/mm that is typical of what is dense in it).
+
+    Where rows are cut off inside the object, nothing is put where views cannot see all round: what FDK finds there
+    is smeared over the whole corner, and splats that start with it hold density back from the inside. The splats at
+    the rim reach out for what is missing by themselves."""
+    volume = fdk(images, frames, grid, threads)
+    if cut_off(images, frames):
+        volume[coverage(frames, grid) < _SEEN] = 0
+    return splats_from_volume(volume, grid, count, rng), float(np.percentile(volume, 99.9))
+
+
+def cut_off(images: Floats, frames: Frames) -> bool:
+    """Whether the object reaches an end of the rows, in the direction across the axis."""
+    frames, images = _rows_across_axis(frames, images)
+    limit = _ABOVE_AIR * float(images.max())
+    weights = ray_weights(frames)
+    # Of a half fan the end near the axis is always inside the object, and counts for nothing.
+    counts = weights / np.maximum(weights.max(axis=1, keepdims=True), 1e-30) > _COUNTS
+    return any(
+        float((images[:, :, end] > limit).mean(axis=1) @ counted) > _ENOUGH * len(images)
+        for end, counted in ((0, counts[:, 0]), (-1, counts[:, -1]))
+    )
 
 
 def splats_from_volume(
