@@ -11,7 +11,6 @@ object can take it up entirely. Only air tells, so where there is too little of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -52,10 +51,10 @@ def offsets(
 
     images [views, rows, cols] as measured; mask [rows, cols] share of good pixels; top: largest line integral."""
     found, air = np.zeros(len(frames)), 0.0
-    drawn = np.empty(images.shape[1:], np.float32)
+    drawn, level = np.empty(images.shape[1:], np.float32), _AIR * top
     for k, frame in enumerate(frames.packed()):
         renderer.render(frame, frames.beam == "cone", *splats.arrays(), drawn)
-        weight = 1 / (1 + (drawn / np.float32(_AIR * top)) ** 2)
+        weight = 1 / (1 + (drawn.astype(np.float64) / level) ** 2)
         if mask is not None:
             weight = weight * mask
         air += float((weight > 0.5).mean()) / len(frames)
@@ -66,9 +65,9 @@ def offsets(
     return found if air > _LEAST_AIR else found - found.mean()
 
 
-def _median(values: Floats, weights: Floats) -> tuple[float, float]:
+def _median(values: Floats, weights: Array) -> tuple[float, float]:
     """(weighted median, weighted mean distance from it)"""
-    flat, weight = values.ravel(), weights.ravel().astype(np.float64)
+    flat, weight = values.ravel(), weights.ravel()
     order = np.argsort(flat)
     sums = np.cumsum(weight[order])
     if not sums[-1] > 0:

@@ -11,9 +11,11 @@ import numpy as np
 from splatcore.geometry import Array, Frames
 from splatcore.grid import VolumeGrid
 from splatcore.projections import Conversion, Image, Stacks
+from splatcore.redundancy import lopsidedness
 from splatcore.scanjson import ScanHeader
 
 _SAMPLE = 400_000  # pixels looked at for percentiles
+_FULL_TURN, _HALF_FAN = 350.0, 0.3  # degrees; share of the longer side that the shorter one lacks
 
 
 @dataclass(frozen=True)
@@ -154,15 +156,22 @@ def geometry_warnings(header: ScanHeader, grid: VolumeGrid, arc_deg: float) -> l
         found.append(f"only {len(frames)} views")
     if arc_deg < 175:
         found.append(f"the views cover {arc_deg:.0f} degrees only; below 180 parts of the object stay unseen")
+    elif arc_deg < _FULL_TURN and lopsidedness(frames) > _HALF_FAN:
+        found.append(
+            f"the detector is off its middle (half fan) and the views cover {arc_deg:.0f} degrees only: without a full "
+            "turn the object's outer parts are seen from one side alone"
+        )
     with np.errstate(divide="ignore", invalid="ignore"):  # a middle level with a source is not seen
         position = frames.project(np.array([grid.center_mm]))[:, 0]
     seen = np.all((position > -0.5) & (position < np.array([frames.cols, frames.rows]) - 0.5), axis=1)
     if seen.mean() < 0.5:
         found.append(f"the volume's middle falls off the detector in {np.count_nonzero(~seen)} of {len(frames)} views")
-    if header.exposure is not None and header.kind != "line_integrals":
+    if header.exposure is not None and header.kind == "line_integrals":
         spread = max(header.exposure) / min(header.exposure) - 1
         if spread > 0.01:
-            found.append(f"the exposure differs by {spread:.0%} between views; the images are not corrected for it")
+            found.append(
+                f"the exposure differs by {spread:.0%} between views; line integrals are taken to be corrected for it"
+            )
     return found
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatcore.geometry import Array, Frames
 from splatcore.splats import Floats
@@ -61,7 +62,7 @@ def in_plane(frames: Frames) -> Array:
     return free
 
 
-def unseen(frames: Frames) -> tuple[Array, Array]:
+def unseen(frames: Frames) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Components of omega and of tau that share in a direction which leaves the plane. [views, 3] each, bool"""
     seen = np.diagonal(in_plane(frames), axis1=1, axis2=2) > 1 - 1e-6
     return ~seen[:, :3], ~seen[:, 3:6]

@@ -127,6 +127,8 @@ class Conversion:
             name = stacks.bad_pixels.name if stacks.bad_pixels else stacks.flat[0].name
             doc.note(name, f"marks {np.count_nonzero(self.bad)} of {self.bad.size} pixels as bad", "bad is not 0")
         self._fill = NeighbourFill(self.bad)
+        given = np.array(header.exposure or np.ones(len(header.frames)))
+        self._exposure = (given / given.mean()).tolist()
 
     def _mean(self, stacks: tuple[TiffHeader, ...]) -> NDArray[np.float64]:
         """The mean page of stacks, times scale. [rows, cols]"""
@@ -152,26 +154,28 @@ class Conversion:
 
     def views(self) -> Iterator[Image]:
         """Line integrals, view by view in page order. Notes pages that hold pixels which are not finite."""
+        exposure = iter(self._exposure)
         for stack in self.stacks.images:
             for number, page in enumerate(read_pages(stack)):
                 with np.errstate(over="ignore", invalid="ignore"):
                     image = page.astype(np.float32) * np.float32(self.header.scale)
                     self._mend(image, stack, number)
-                    image = self._integrals(image, stack)
+                    image = self._integrals(image, stack, next(exposure))
                     self._mend(image, stack, number)
                 yield self._fill(image)
 
-    def _integrals(self, image: Image, stack: TiffHeader) -> Image:
+    def _integrals(self, image: Image, stack: TiffHeader, exposure: float) -> Image:
+        """exposure: of this view, as a share of the mean over views."""
         if self.header.kind == "line_integrals":
             return image
         step = abs(self.header.scale) / 2 if np.dtype(stack.dtype).kind in "ui" else None  # half a count
         if self.header.kind == "counts":
-            image = ((image - self.dark) / self.light).astype(np.float32)
-            lowest = (
-                np.float32(_SMALLEST_FLOAT_TRANSMISSION) if step is None else (step / self.light).astype(np.float32)
-            )
+            light = self.light * exposure
+            image = ((image - self.dark) / light).astype(np.float32)
+            lowest = np.float32(_SMALLEST_FLOAT_TRANSMISSION) if step is None else (step / light).astype(np.float32)
         else:
-            lowest = np.float32(_SMALLEST_FLOAT_TRANSMISSION if step is None else step)
+            image = image / np.float32(exposure)
+            lowest = np.float32(_SMALLEST_FLOAT_TRANSMISSION if step is None else step / exposure)
         below = (image < lowest) & ~self.bad
         count = int(np.count_nonzero(below))
         if count:

@@ -74,13 +74,21 @@ def ray_weights(frames: Frames) -> Array:
     turn = orbit(frames)
     distance, opposite = _midplane_rays(frames)
     low, high = distance.min(axis=1), distance.max(axis=1)
-    half = (high - low) / (2 * max(frames.cols - 1, 1))  # to the edges of the outer pixels
+    pixel = np.linalg.norm(frames.u, axis=1) * frames.isocentre_depth()
+    half = (high - low) / (2 * (frames.cols - 1)) if frames.cols > 1 else pixel / 2  # to the edges of the outer pixels
     low, high = low - half, high + half
     here = turn.confidence(turn.angle)[:, None] * _on_detector(distance, low[:, None], high[:, None])
     other = _nearest(turn.angle, opposite)
     there = turn.confidence(opposite) * _on_detector(-distance, low[other], high[other])
     share = np.where(here > 0, here / np.maximum(here + there, 1e-12), 0.0)
     return turn.step[:, None] * share * max(1.0, np.pi / turn.arc)
+
+
+def lopsidedness(frames: Frames) -> float:
+    """How far the detector is off its middle: 0 where the axis is in it, 1 where the axis is at its end or off it."""
+    distance, _ = _midplane_rays(frames)
+    low, high = -distance.min(axis=1), distance.max(axis=1)
+    return float(np.median(1 - np.maximum(np.minimum(low, high), 0) / np.maximum(np.maximum(low, high), 1e-9)))
 
 
 def coverage(frames: Frames, grid: VolumeGrid) -> Array:

@@ -31,7 +31,7 @@ class Scan:
     volume: VolumeGrid
     time_s: tuple[float, ...] | None = None  # per view; page order is time order where None
     bad_pixels: Mask | None = None  # [rows, cols], True is bad
-    exposure: tuple[float, ...] | None = None  # per view, as given; the projections are not corrected for it
+    exposure: tuple[float, ...] | None = None  # per view, as given; counts and transmissions were divided by it
     tolerance: Tolerance | None = None
     simulation: dict[str, Any] | None = None  # the truth of a simulated scan, for `evaluate` alone
     folder: Path | None = None

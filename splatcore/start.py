@@ -33,8 +33,8 @@ def fdk(projections: Floats, frames: Frames, grid: VolumeGrid, threads: int, han
     weights = ray_weights(frames)
     for k in range(len(frames)):
         filtered = _filter(projections[k], frames[k : k + 1], weights[k], hann, threads)
-        if frames.rows == 1:  # rounding alone lifts a voxel off the only row; the same row on either side catches it
-            filtered = np.repeat(filtered, 3, axis=0)
+        for axis in np.flatnonzero(np.equal(filtered.shape, 1)):  # rounding lifts voxels off an only row or column:
+            filtered = np.repeat(filtered, 3, axis=axis)  # the same one on either side catches them
         _native.backproject(packed[k], frames.beam == "cone", box, filtered, 1.0, volume, threads)
     return volume
 
@@ -104,7 +104,8 @@ def first_splats(
     the rim reach out for what is missing by themselves."""
     volume = fdk(images, frames, grid, threads)
     if cut_off(images, frames):
-        volume[coverage(frames, grid) < _SEEN] = 0
+        kept = np.where(coverage(frames, grid) >= _SEEN, volume, 0)
+        volume = kept if np.percentile(kept, 99.9) > 0 else volume  # nothing may be seen all round
     return splats_from_volume(volume, grid, count, rng), float(np.percentile(volume, 99.9))
 
 

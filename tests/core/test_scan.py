@@ -113,6 +113,43 @@ def test_counts_use_the_mean_flat_and_dark(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_scan(folder).projections, truth, atol=2e-4)
 
 
+def test_a_half_fan_without_a_full_turn_is_told(tmp_path: Path) -> None:
+    """16 columns of 1.5 mm, so that 6 mm put the axis half way to the detector's end."""
+    for name, offset, arc, told in (("a", 6.0, 240, True), ("b", 6.0, 360, False), ("c", 0.0, 240, False)):
+        changes = {
+            "/geometry/detector/offset_mm": [0.0, offset],
+            "/geometry/angles_deg": [arc / VIEWS * k for k in range(VIEWS)],
+        }
+        facts = check_scan(write_scan(tmp_path / name, changes=changes))
+        assert any("half fan" in text for text in facts.warnings) == told
+
+
+def test_a_detector_beside_the_object_is_told(tmp_path: Path) -> None:
+    facts = check_scan(write_scan(tmp_path, changes={"/geometry/detector/offset_mm": [0.0, 40.0]}))
+    assert any("falls off the detector" in text for text in facts.warnings)
+
+
+@pytest.mark.parametrize("kind", ["counts", "transmission"])
+def test_the_exposure_of_a_view_is_divided_out(tmp_path: Path, kind: str) -> None:
+    truth = plain_images()
+    exposure = np.linspace(80.0, 120.0, VIEWS)  # as a tube logs it; the flat was taken at their mean
+    light = 50_000.0 if kind == "counts" else 1.0
+    images = 100.0 * (kind == "counts") + light * (exposure / 100)[:, None, None] * np.exp(-truth)
+    changes = {"/projections/kind": kind, "/projections/exposure": exposure.tolist()}
+    if kind == "counts":
+        changes |= {"/projections/flat": ["flat.tif"], "/projections/dark": ["dark.tif"]}
+    folder = write_scan(tmp_path, images.astype(np.float32), changes)
+    write_tiff(folder / "flat.tif", np.full((ROWS, COLS), light + 100, np.float32))
+    write_tiff(folder / "dark.tif", np.full((ROWS, COLS), 100, np.float32))
+    np.testing.assert_allclose(read_scan(folder).projections, truth, atol=1e-5)
+
+
+def test_line_integrals_are_taken_to_be_corrected_for_exposure(tmp_path: Path) -> None:
+    folder = write_scan(tmp_path, changes={"/projections/exposure": [1.0 + k / 10 for k in range(VIEWS)]})
+    np.testing.assert_array_equal(read_scan(folder).projections, plain_images())
+    assert any("taken to be corrected" in text for text in check_scan(folder).warnings)
+
+
 def test_no_light_is_clamped_to_half_a_count_and_told(tmp_path: Path) -> None:
     counts = np.full((VIEWS, ROWS, COLS), 1000, np.uint16)
     counts[2, 3, 4:6] = 0
