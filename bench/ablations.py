@@ -113,7 +113,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--bin", type=int, default=1, help="average blocks of the volume's voxels first")
     parser.add_argument("--only", choices=["switches", "fdk"], help="one of the two tables")
-    parser.add_argument("--quick", action="store_true", help="a quarter of the resolution, 1,500 steps, 4,000 splats")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="a quarter of the resolution, 1,500 steps, 4,000 splats: shows that it runs, not what a switch brings",
+    )
     parser.add_argument("--json", type=Path, help="also write the rows to this file")
     args = parser.parse_args()
     if args.quick:
