@@ -20,9 +20,10 @@ from splatcore import r2
 from splatcore.descent import Descent, Rates
 from splatcore.diagnose import diagnose
 from splatcore.errors import OptionsError, ReconstructionError
-from splatcore.gate import Decision, gate
+from splatcore.gate import Decision, gate, information
 from splatcore.gauge import settle
 from splatcore.geometry import Array, Frames, RigidMotions
+from splatcore.jitter import narrowed
 from splatcore.machine import threads_allowed
 from splatcore.options import Options
 from splatcore.poses import (
@@ -225,6 +226,8 @@ class _Run:
         self._decision = gate(
             here, self._motions, self._normals, self._prior, time=moment, seed=self._options.seed, threads=self._threads
         )
+        if self._decision.model == "full":
+            self._prior = narrowed(self._prior, self._motions, information(self._normals))
         _, self._motions = settle(here.nominal, self._decision.motions)
         self._timings["gate"] = time.monotonic() - began
         yield self.progress("poses", self._decision.sentence(), level=here.factor)
