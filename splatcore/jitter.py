@@ -27,8 +27,10 @@ def narrowed(prior: Prior, motions: RigidMotions, information: Array) -> Prior:
     """The widest prior, isotropic in rotation and in translation, that the poses do not contradict; never wider
     than the one given. information [views, 6, 6]: of each pose, the volume taken as known."""
     omega, tau = motions.vectors()
-    ridge = 1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(6) / 6
-    covariance = _VOLUME_UNKNOWN * np.linalg.inv(information + ridge + np.diag(1e-3 * prior.precision()))
+    # In units of the prior, which also bounds what a view does not show at all (a shift along a parallel ray).
+    unit = 1 / np.sqrt(prior.precision())
+    covariance = unit[:, None] * np.linalg.inv(unit[:, None] * information * unit + np.eye(6)) * unit
+    covariance *= _VOLUME_UNKNOWN
     return replace(
         prior,
         rotation=min(prior.rotation, _COARSE * _widest(omega, covariance[:, :3, :3])),
@@ -44,6 +46,6 @@ def _widest(values: Array, covariance: Array) -> float:
     eigenvalues, axes = np.linalg.eigh(covariance)
     squares = np.einsum("vij,vi->vj", axes, values) ** 2
     widths = size * _WIDTHS
-    variance = eigenvalues + widths[:, None, None] ** 2
+    variance = np.maximum(eigenvalues, 0) + widths[:, None, None] ** 2
     likelihood = -0.5 * (np.log(variance) + squares / variance).sum(axis=(1, 2))
     return float(widths[np.flatnonzero(likelihood > likelihood.max() - _CONTRADICTED)[-1]])

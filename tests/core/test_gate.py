@@ -80,10 +80,14 @@ def test_the_gate_finds_how_the_scan_moved(truth, states):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [21, 22, 23, 24])
+@pytest.mark.parametrize("seed", [21, 22])
 def test_the_gate_never_allows_less_than_the_scan_had(seed, tmp_path):
-    """Four more draws of everything, some of it small: jitter of 0.003 rad and 0.1 voxel is a fifth of a pixel here."""
-    cases = [*TRUTHS.items(), ("full", {"sigma_rot": 0.003, "sigma_trans": 0.1}), ("smooth", {"drift_rot_deg": 0.4})]
+    """Two more draws of everything, some of it small: jitter of 0.003 rad and 0.1 voxel is a fifth of a pixel here."""
+    cases = [
+        *TRUTHS.items(),
+        ("full", {"sigma_rot": 0.003, "sigma_trans": 0.1}),
+        ("smooth", {"drift_rot_deg": 0.3, "drift_trans_vox": 0.3}),
+    ]
     exact = 0
     for number, (truth, motion) in enumerate(cases):
         decision = gate(*state(tmp_path / str(number), seed, **motion), PRIOR)

@@ -55,3 +55,11 @@ def test_units_do_not_matter():
     assert inches.rotation == pytest.approx(plain.rotation) and inches.translation == pytest.approx(
         25.4 * plain.translation
     )
+
+
+def test_what_no_view_shows_does_not_disturb():
+    """Shifts along x leave no trace: the others still tell the width."""
+    motions, known = drawn(0.002, 0.2, 2)
+    unseen = np.diag([1.0, 1, 1, 0, 1, 1])
+    found = narrowed(WIDE, motions, unseen @ known @ unseen)
+    assert 1.0 < found.rotation / 0.002 < 2.2 and 0.8 < found.translation / 0.2 < 3
