@@ -14,17 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from splatcore.descent import Descent, Rates
-from splatcore.errors import ReconstructionError
 from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.options import Options
 from splatcore.poses import Normals, accumulate
 from splatcore.pyramid import Level, factors, level
 from splatcore.scan import Scan
-from splatcore.start import fdk, splats_from_volume
+from splatcore.trial import try_frames
 
-_STEPS = 500
-_SPLATS = 8_000
 _HOLD_OUT_EVERY = 8
 _MOST_MISSED = 0.5  # share of the images' RMS; with more left over, residuals do not speak of the geometry
 
@@ -38,27 +34,14 @@ class Trial:
     held_out_rms: float
 
 
-def try_frames(here: Level, frames: Frames, held_out: Array, seed: int, threads: int) -> Trial:
+def _judged(here: Level, frames: Frames, held_out: Array, seed: int, threads: int) -> Trial:
     """A short reconstruction with fixed frames from the views that are not held out, and its residuals."""
-    kept = np.flatnonzero(np.logical_not(held_out))
-    rng = np.random.default_rng(seed)
-    volume = fdk(here.images[kept], frames[kept], here.grid, threads)
-    try:
-        splats = splats_from_volume(volume, here.grid, _SPLATS, rng)
-    except ReconstructionError:  # these frames see nothing from these views; the reconstruction itself is made
+    descent = try_frames(here, frames, np.flatnonzero(np.logical_not(held_out)), seed, threads)
+    if descent is None:  # these frames see nothing from these views; the reconstruction itself is made
         return _blank(here, held_out)
-    top = float(here.images.max())
-    descent = Descent(
-        splats, frames.rows, frames.cols, voxel_mm=here.voxel_mm, density_unit=float(np.percentile(volume, 99.9)),
-        steps=_STEPS, rates=Rates(), huber=1e-4 * top, dssim=0.0, data_range=top, threads=threads,
-    )  # fmt: skip
-    packed = frames.packed()
-    for step in range(_STEPS):
-        if step % len(kept) == 0:
-            order = rng.permutation(kept)
-        view = order[step % len(kept)]
-        descent.step(packed[view], frames.beam == "cone", here.images[view], here.mask)
-    normals = accumulate(descent.renderer, descent.splats, frames, here.images, here.mask, 1e3 * top)
+    normals = accumulate(
+        descent.renderer, descent.splats, frames, here.images, here.mask, 1e3 * float(here.images.max())
+    )
     pixels = np.maximum(normals.pixels[held_out].sum(), 1.0)
     return Trial(normals.rms, normals.explained(), float(np.sqrt(normals.residual_ss[held_out].sum() / pixels)))
 
@@ -84,10 +67,10 @@ def diagnose(
     scales = factors(scan, 1)
     here = level(scan, scales[-2] if len(scales) > 1 else scales[-1])
     held_out = np.arange(len(scan.frames)) % _HOLD_OUT_EVERY == _HOLD_OUT_EVERY // 2
-    before = try_frames(here, here.nominal, held_out, options.seed, threads)
+    before = _judged(here, here.nominal, held_out, options.seed, threads)
     after = before
     if options.calibrate != "none":
-        after = try_frames(here, corrected.binned(here.factor), held_out, options.seed, threads)
+        after = _judged(here, corrected.binned(here.factor), held_out, options.seed, threads)
     missed = float(np.sqrt((after.rms**2).mean() / max(float((here.images.astype(np.float64) ** 2).mean()), 1e-60)))
     omega, tau = corrections.vectors()
     rotation_rms = float(np.rad2deg(np.sqrt((omega**2).sum(axis=1).mean())))

@@ -20,8 +20,10 @@ from splatcore import r2
 from splatcore.descent import Descent, Rates
 from splatcore.diagnose import diagnose
 from splatcore.errors import OptionsError, ReconstructionError
+from splatcore.gate import Decision, gate, information
 from splatcore.gauge import settle
 from splatcore.geometry import Array, Frames, RigidMotions
+from splatcore.jitter import narrowed
 from splatcore.machine import threads_allowed
 from splatcore.options import Options
 from splatcore.poses import (
@@ -88,7 +90,10 @@ def reconstruct(scan: Scan, options: Options | None = None) -> Generator[Progres
     scales = factors(scan, _FINEST[options.quality])
     run.plan(scales)
     for factor in scales:
-        yield from run.level(level(scan, factor))
+        here = level(scan, factor)
+        yield from run.level(here)
+        if factor == scales[max(len(scales) - 2, 0)] and factor != scales[-1]:
+            yield from run.gate(here)
     return (yield from run.finish())
 
 
@@ -141,6 +146,7 @@ class _Run:
         self._radius = half
         self._offset = 0.0  # of the rotation axis along u, mm at the isocentre
         self._motions = RigidMotions.identity(len(scan.frames))
+        self._decision: Decision | None = None
         self._splats: Splats | None = None
         self._normals: Normals | None = None
         self._deviation = 0.0  # robust residual, line-integral units, from the last sweep
@@ -196,7 +202,8 @@ class _Run:
                 )
             self._advance(work, step)
             moved: dict[str, float] = {}
-            if self._options.calibrate != "none" and step >= first_sweep:
+            fixed = self._options.calibrate == "none" or (self._decision and self._decision.model == "none")
+            if not fixed and step >= first_sweep:
                 moved = self._sweep(here, descent)
                 packed = self._corrected(here.nominal).packed()
             yield self.progress(
@@ -208,6 +215,22 @@ class _Run:
         self._splats = descent.splats
         self._normals = self._accumulate(here, descent)
         self._timings[f"binning_{here.factor}"] = time.monotonic() - began
+
+    def gate(self, here: Level) -> Generator[Progress, None, None]:
+        """Before the finest level: how freely views may move from here on."""
+        if self._options.calibrate != "full" or self._options.gate == "off":
+            return
+        assert self._normals is not None
+        began, time_s = time.monotonic(), self._scan.time_s
+        moment = None if time_s is None else np.array(time_s)
+        self._decision = gate(
+            here, self._motions, self._normals, self._prior, time=moment, seed=self._options.seed, threads=self._threads
+        )
+        if self._decision.model == "full":
+            self._prior = narrowed(self._prior, self._motions, information(self._normals))
+        _, self._motions = settle(here.nominal, self._decision.motions)
+        self._timings["gate"] = time.monotonic() - began
+        yield self.progress("poses", self._decision.sentence(), level=here.factor)
 
     def _corrected(self, nominal: Frames) -> Frames:
         """Static part first, then every view's own."""
@@ -234,6 +257,8 @@ class _Run:
             limit = np.array([reach / self._radius] * 3 + [3 * reach] * 3)
             caution = 1.0 if here.factor == min(self._works) else _CAUTION
             motions, strain = step_full(normals, before, self._prior, limit, caution)
+            if self._decision is not None:
+                motions = self._decision.restrict(here.nominal, motions, normals)
             similarity, self._motions = settle(here.nominal, motions)
             stretched = (descent.splats.means @ (np.eye(3) + strain)).astype(np.float32)
             descent.replace(replace(descent.splats, means=stretched).moved(similarity))
@@ -259,6 +284,8 @@ class _Run:
         report = diagnose(
             scan, options, corrected, corrections, static, self._normals, (sigma_omega, sigma_tau), self._threads
         )
+        if self._decision is not None:
+            report["findings"].append(self._decision.finding())
         self._timings["diagnose"] = time.monotonic() - began
         self._timings["total"] = time.monotonic() - self._began
         self._fraction = 1.0
