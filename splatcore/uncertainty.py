@@ -22,6 +22,7 @@ from splatcore.splats import Floats, Splats
 
 _LARGEST = 128  # detector edge on which derivative images are drawn; finer detail belongs to single views
 _STEP_PX = 0.25  # of the central differences
+_BLOCKS = 16  # a side of the detector
 _COUPLED = 160  # views up to which poses are solved with each other's; beyond, each by itself
 
 
@@ -32,7 +33,7 @@ class Slices:
     spectra: np.ndarray  # complex64 [views, 6, cols, rows // 2 + 1]: along u whole, along v the half from zero up
     weights: Array  # [rows // 2 + 1]: how often a frequency along v counts; sum |spectra|^2 weights = sum of squares
     f_u: Array  # [cols] cycles per mm at the isocentre
-    noise: Array  # [views] variance of a full-size pixel where the image depends on the pose
+    scores: Array  # [views, 6, 6] scatter of the pose's gradient
 
 
 def pose_covariance(
@@ -50,7 +51,10 @@ def pose_covariance(
         fisher = joint_fisher(seen, overlap, frames)
     else:
         fisher = _blocks(seen, overlap)
-    return settled_covariance(fisher, frames, prior)
+    own = np.einsum("vivj->vij", fisher.reshape(len(frames), 6, len(frames), 6))
+    noise = np.trace(np.linalg.solve(own, seen.scores), axis1=1, axis2=2) / 6
+    scale = np.repeat(1 / np.sqrt(noise), 6)
+    return settled_covariance(fisher * scale[:, None] * scale, frames, prior)
 
 
 def _extent(splats: Splats) -> Array:
@@ -79,7 +83,6 @@ def joint_fisher(seen: Slices, overlap: Array, frames: Frames) -> Array:
     # A view from the other side shows the same slice with u turned round.
     side = np.einsum("ki,ji->kj", axes[:, 0], axes[:, 0]) >= 0
     scaled = seen.spectra * np.sqrt(seen.weights).astype(np.float32)
-    scaled /= np.sqrt(seen.noise).astype(np.float32)[:, None, None, None]
     fisher = np.zeros((views, 6, views, 6))
     for index in range(cols):
         here = scaled[:, :, index].reshape(6 * views, rows)
@@ -133,13 +136,13 @@ def _slices(
     steps = np.array([_STEP_PX * pitch / radius] * 3 + [_STEP_PX * pitch] * 3)
     middle = small.project(np.zeros((1, 3)))[:, 0]
     spectra = np.empty((views, 6, cols, rows // 2 + 1), np.complex64)
-    noise = np.empty(views)
+    scores = np.empty((views, 6, 6))
     image = np.empty((frames.rows, frames.cols), np.float32)
     packed, cone = frames.packed(), frames.beam == "cone"
     for k in range(views):
         derivative = _derivatives(renderer, splats, small[k : k + 1], steps)
         fine.render(packed[k], cone, *splats.arrays(), image)
-        noise[k] = _local_noise(derivative, image - images[k], mask, huber, factor)
+        scores[k] = _scores(derivative, image - images[k], mask, huber, factor)
         turn = np.exp(2j * np.pi * (fft.fftfreq(cols) * middle[k, 0])[:, None])
         turn = turn * np.exp(2j * np.pi * fft.rfftfreq(rows) * middle[k, 1])
         spectrum = fft.rfft(derivative, axis=1, workers=threads)  # along v
@@ -149,7 +152,7 @@ def _slices(
     if rows % 2 == 0:
         weights[-1] = 1.0
     weights *= factor**2 / (rows * cols)
-    return Slices(spectra, weights, fft.fftfreq(cols) / pitch, noise)
+    return Slices(spectra, weights, fft.fftfreq(cols) / pitch, scores)
 
 
 def _derivatives(renderer: _native.Renderer32, splats: Splats, frame: Frames, steps: Array) -> Floats:
@@ -163,20 +166,21 @@ def _derivatives(renderer: _native.Renderer32, splats: Splats, frame: Frames, st
     return (images[0] - images[1]) / (2 * steps[:, None, None]).astype(np.float32)
 
 
-def _local_noise(derivative: Floats, residual: Floats, mask: Floats | None, huber: float, factor: int) -> float:
-    """Variance of a pixel's residual where the image depends on the pose: White's sandwich over the plain normal
-    equations, one number for all six directions. Noise is larger behind the object than beside it."""
-    weight = np.minimum(1, huber / np.maximum(np.abs(residual), 1e-30))
+def _scores(derivative: Floats, residual: Floats, mask: Floats | None, huber: float, factor: int) -> Array:
+    """Sum of outer products of the score over square blocks of the detector, as small as the model's own error is
+    wide: what the pose's gradient scatters by, however pixels depend on each other. [6, 6]"""
+    weight = np.minimum(1, huber / np.maximum(np.abs(residual), 1e-20))
+    inside = (np.abs(residual) <= huber).astype(np.float64)
     if mask is not None:
-        weight = weight * mask
-    meat = _block_mean((weight * residual) ** 2, factor).ravel()
-    bread = _block_mean(weight, factor).ravel()
-    flat = derivative.reshape(6, -1).astype(np.float64)
-    plain, weighted = flat @ flat.T, (flat * bread) @ flat.T
-    scale = np.sqrt(np.diagonal(plain))
-    ridge = 1e-9 * np.diag(scale**2) + 1e-300 * np.eye(6)
-    half = np.linalg.solve(weighted + ridge, (flat * meat) @ flat.T)
-    return float(np.trace(half @ np.linalg.solve(weighted + ridge, plain)) / 6)
+        weight, inside = weight * mask, inside * mask
+    score = derivative * (_block_mean(weight * residual, factor) * factor**2)
+    edge = max(1, min(score.shape[1:]) // _BLOCKS)
+    rows, cols = score.shape[1] // edge, score.shape[2] // edge
+    blocks = score[:, : rows * edge, : cols * edge].reshape(6, rows, edge, cols, edge).sum(axis=(2, 4)).reshape(6, -1)
+    # A pixel beyond the corner adds to the scatter but no longer to the curvature.
+    squares = (derivative.astype(np.float64) ** 2).sum(axis=0)
+    kept = float((squares * _block_mean(inside, factor)).sum() / max(float(squares.sum()), 1e-300))
+    return (blocks.astype(np.float64) @ blocks.T) / max(kept, 0.1) ** 2
 
 
 def _block_mean(image: Array, factor: int) -> Array:
