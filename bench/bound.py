@@ -105,7 +105,10 @@ class JointProblem:
         self._weight = 1 / self._noise**2
         derivatives = derivative_images(volume, grid, frames, threads)
         fisher = np.stack(
-            [(d * w) @ d.T for d, w in zip(derivatives.astype(np.float64), self._weight.astype(np.float64), strict=True)]
+            [
+                (d * w) @ d.T
+                for d, w in zip(derivatives.astype(np.float64), self._weight.astype(np.float64), strict=True)
+            ]
         )
         self.known = np.linalg.inv(fisher)  # covariance [views, 6, 6]
         self._unit = np.linalg.cholesky(self.known)
@@ -297,7 +300,9 @@ def main() -> None:
     parser.add_argument("--threads", type=int)
     parser.add_argument("--json", type=Path, help="also write the bounds to this file")
     args = parser.parse_args()
-    print("| scan | prior | known rot (deg) | known trans (voxel) | ratio rot | ratio trans | joint rot | joint trans |")
+    print(
+        "| scan | prior | known rot (deg) | known trans (voxel) | ratio rot | ratio trans | joint rot | joint trans |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     rows = []
     for folder in args.scans:
