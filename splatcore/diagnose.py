@@ -259,7 +259,9 @@ def _sigma_note(options: Options) -> dict[str, Any] | None:
     return {
         "name": "uncertainty",
         "severity": "note",
-        "text": "Standard deviations of the poses take the volume as known; with the volume unknown too they are "
-        "typically one to three times larger.",
+        "text": "Standard deviations of the poses count what the images leave open with the volume unknown too, and "
+        "how far residuals scatter. They hold for poses relative to each other: the world as a whole is settled by the "
+        "nominal geometry. On simulated scans about two thirds of all errors lie within one of them; rotation about "
+        "the axis is stated up to a third too small.",
         "evidence": {},
     }

@@ -25,7 +25,7 @@ from splatcore.splats import Floats, Splats
 
 _LARGEST = 128  # detector edge on which derivative images are drawn; finer detail belongs to single views
 _STEP_PX = 0.25  # of the central differences
-_BLOCKS = 16  # a side of the detector, of the scores; 32 gives the same, 64 is narrower than the model's own error
+_BLOCKS = 16  # a side of the detector, of the scores; 32 give the same, with few the scores' zero sum shows
 _COUPLED = 160  # views up to which poses are solved with each other's; beyond, each by itself
 _FAINTEST = 0.01  # of the median density: fainter splats do not say how far the object reaches
 
@@ -199,8 +199,8 @@ def _derivatives(renderer: _native.Renderer32, splats: Splats, frame: Frames, st
 
 
 def _scores(derivative: Floats, residual: Floats, mask: Floats | None, huber: float, factor: int) -> Array:
-    """Sum of outer products of the score over square blocks of the detector, as small as the model's own error is
-    wide: what the pose's gradient scatters by, however pixels depend on each other. [6, 6]"""
+    """Outer products of the score, summed over square blocks of the detector: the scatter of the pose's gradient,
+    however pixels of a block depend on each other. [6, 6]"""
     weight = np.minimum(1, huber / np.maximum(np.abs(residual), 1e-20))
     inside = (np.abs(residual) <= huber).astype(np.float64)
     if mask is not None:
