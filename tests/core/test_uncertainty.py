@@ -183,7 +183,7 @@ def test_an_unknown_volume_never_helps_and_a_weaker_prior_hurts() -> None:
 @pytest.mark.slow
 def test_stated_uncertainties_cover_the_errors(tmp_path: Path) -> None:
     """All components but rotation about the axis: of this object, nearly round, it errs by a few slow waves over the
-    turn, which the engine settles late and the statement does not know of (docs/method.md)."""
+    turn, which the statement does not know of (docs/method.md)."""
     scan = scan_of(tmp_path, Simulation(views=48, sigma_rot=0.02, sigma_trans=1.0, noise="r2", seed=4), edge=48)
     result = drain(reconstruct(scan, Options(threads=2)))
     quotient = coverage.quotients(
