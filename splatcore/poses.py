@@ -2,7 +2,7 @@
 
 A view's increment is the rigid motion x -> Exp(omega) x + tau of the object in the world, applied before
 the pose found so far. Its normal equations come from the core (`motion_normal`), with Huber weights; the
-prior says how far the scanner's poses are from nominal. What the poses are worth is `uncertainty`'s to say.
+prior says how far the scanner's poses are from nominal; the inverse 6x6 is the pose's covariance.
 """
 
 from __future__ import annotations
@@ -141,3 +141,11 @@ def _along_u(frames: Frames) -> Array:
 def axis_column(corrected: Frames) -> float:
     """`cor_px`: the detector column on which the rotation axis falls at the isocentre's height, mean over views."""
     return float(corrected.project(np.zeros((1, 3)))[:, 0, 0].mean())
+
+
+def sigmas(normals: Normals, prior: Prior) -> tuple[Array, Array]:
+    """One standard deviation of rotation [views, 3] rad and translation [views, 3] mm, the volume taken as known."""
+    noise = normals.noise
+    precision = normals.rigid / noise[:, None, None] + np.diag(prior.precision())
+    deviation = np.sqrt(np.diagonal(np.linalg.inv(precision), axis1=1, axis2=2))
+    return deviation[:, :3], deviation[:, 3:]
