@@ -32,7 +32,6 @@ from splatcore.poses import (
     accumulate,
     axis_column,
     off_centre,
-    sigmas,
     split_static,
     step_full,
     step_static,
@@ -43,6 +42,7 @@ from splatcore.reconstruction import Reconstruction
 from splatcore.scan import Scan
 from splatcore.splats import Splats
 from splatcore.start import fdk, splats_from_volume
+from splatcore.uncertainty import pose_covariance
 
 # Adam steps at each binning factor. Coarse steps cost a hundredth of fine ones.
 _STEPS = {8: 600, 4: 750, 2: 1200, 1: 2400}
@@ -310,10 +310,15 @@ class _Run:
 
     def _sigmas(self, corrected: Frames) -> tuple[Array, Array]:
         """Standard deviations of omega [views, 3] rad and tau [views, 3] mm; zero for what was not fitted."""
-        assert self._normals is not None
         if self._options.calibrate != "full":
             return np.zeros((len(corrected), 3)), np.zeros((len(corrected), 3))
-        omega, tau = sigmas(self._normals, self._prior)
+        assert self._splats is not None
+        here = level(self._scan, min(self._works))
+        huber = _HUBER * self._deviation or float(np.abs(here.images).max())
+        covariance = pose_covariance(
+            self._splats, self._corrected(here.nominal), here.images, here.mask, huber, self._prior, self._threads
+        )
+        omega, tau = np.split(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), 2, axis=1)
         if corrected.beam == "parallel":
             # A shift along the ray changes nothing, so any component that shares in it is unbounded.
             tau = np.where(np.abs(self._scan.frames.source) > 1e-3, np.inf, tau)
