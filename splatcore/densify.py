@@ -55,7 +55,7 @@ class ScreenGradient:
 
     def mean(self) -> Floats:
         """Over the views that showed the splat. [n]"""
-        return self._sum / np.maximum(self._seen, 1).astype(np.float32)
+        return np.asarray(self._sum / np.maximum(self._seen, 1), np.float32)
 
 
 def densify(

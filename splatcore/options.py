@@ -15,6 +15,9 @@ from splatcore.errors import OptionsError
 Calibrate = Literal["full", "static", "none"]
 Quality = Literal["preview", "normal", "fine"]
 Method = Literal["splatct", "r2", "paper"]
+Switch = Literal["on", "off"]
+
+_CHOICES = {"calibrate": Calibrate, "gate": Switch, "quality": Quality, "method": Method}
 
 
 def _knob(default: Any, help: str, low: float | None = None, high: float | None = None) -> Any:
@@ -29,6 +32,9 @@ class Options:
         "full", "full: every view's six degrees of freedom; static: the scanner's constant "
         "errors only; none: trust the nominal geometry"
     )  # fmt: skip
+    gate: Switch = _knob(
+        "on", "on: held-out views decide whether views move as freely as `calibrate` allows; off: they do"
+    )  # fmt: skip
     quality: Quality = _knob("normal", "preview stops at half resolution; fine runs longer")
     splats: int | None = _knob(None, "Gaussians at full resolution; default: chosen from the volume", 100, 5_000_000)
     method: Method = _knob(
@@ -42,7 +48,7 @@ class Options:
     threads: int | None = _knob(None, "CPU threads; default: all this process may use", 1, 1024)
 
     def __post_init__(self) -> None:
-        for name, kind in (("calibrate", Calibrate), ("quality", Quality), ("method", Method)):
+        for name, kind in _CHOICES.items():
             if getattr(self, name) not in get_args(kind):
                 raise OptionsError(f"{name}: got {getattr(self, name)!r}, expected one of {', '.join(get_args(kind))}")
         if not isinstance(self.exposure, bool):
@@ -75,11 +81,7 @@ class Options:
 
 def describe() -> list[dict[str, Any]]:
     """Each knob as a plain dict (name, default, choices, low, high, help), for forms and docs."""
-    choices = {
-        "calibrate": list(get_args(Calibrate)),
-        "quality": list(get_args(Quality)),
-        "method": list(get_args(Method)),
-    }
+    choices = {name: list(get_args(kind)) for name, kind in _CHOICES.items()}
     return [
         {"name": k.name, "default": k.default, "choices": choices.get(k.name), **k.metadata}
         for k in dataclasses.fields(Options)

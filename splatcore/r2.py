@@ -61,7 +61,7 @@ class Switches:
 
 
 def resolved(scan: Scan, options: Options) -> Options:
-    """Options with every default filled in.
+    """Options with every default filled in; the loss and the resolution are the method's own.
 
     Raises OptionsError where the method cannot do what is asked of it.
     """
@@ -74,6 +74,7 @@ def resolved(scan: Scan, options: Options) -> Options:
         threads=options.threads or threads_allowed(),
         splats=options.splats or SPLATS,
         steps=options.steps or STEPS,
+        dssim=_DSSIM,
     )
 
 

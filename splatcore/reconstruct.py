@@ -21,8 +21,10 @@ from splatcore.descent import Descent, Rates
 from splatcore.diagnose import diagnose
 from splatcore.errors import OptionsError, ReconstructionError
 from splatcore.exposure import Exposure, finding
+from splatcore.gate import Decision, gate, information
 from splatcore.gauge import settle
 from splatcore.geometry import Array, Frames, RigidMotions
+from splatcore.jitter import narrowed
 from splatcore.machine import threads_allowed
 from splatcore.options import Options
 from splatcore.planar import common_plane, unseen
@@ -32,7 +34,6 @@ from splatcore.poses import (
     accumulate,
     axis_column,
     off_centre,
-    sigmas,
     split_static,
     step_full,
     step_static,
@@ -43,6 +44,7 @@ from splatcore.reconstruction import Reconstruction
 from splatcore.scan import Scan
 from splatcore.splats import Splats
 from splatcore.start import first_splats
+from splatcore.uncertainty import pose_covariance
 
 # Adam steps at each binning factor. Coarse steps cost a hundredth of fine ones.
 _STEPS = {8: 600, 4: 750, 2: 1200, 1: 2400}
@@ -90,7 +92,10 @@ def reconstruct(scan: Scan, options: Options | None = None) -> Generator[Progres
     scales = factors(scan, _FINEST[options.quality])
     run.plan(scales)
     for factor in scales:
-        yield from run.level(level(scan, factor))
+        here = level(scan, factor)
+        yield from run.level(here)
+        if factor == scales[max(len(scales) - 2, 0)] and factor != scales[-1]:
+            yield from run.gate(here)
     return (yield from run.finish())
 
 
@@ -143,6 +148,7 @@ class _Run:
         self._radius = half
         self._offset = 0.0  # of the rotation axis along u, mm at the isocentre
         self._motions = RigidMotions.identity(len(scan.frames))
+        self._decision: Decision | None = None
         self._splats: Splats | None = None
         self._normals: Normals | None = None
         self._exposure = Exposure(len(scan.frames))
@@ -164,7 +170,7 @@ class _Run:
     def level(self, here: Level) -> Generator[Progress, None, None]:
         """One resolution: from backprojection to refined splats and poses."""
         began, work = time.monotonic(), self._works[here.factor]
-        measured, here = here.images, replace(here, images=self._exposure.corrected(here.images))
+        measured, here = here.images, self._steady(here)
         # A mean over pixels gains nothing from the finest ones.
         drifting = self._options.exposure and (here.factor > min(self._works) or len(self._works) == 1)
         top = float(here.images.max())
@@ -202,7 +208,8 @@ class _Run:
                 )
             self._advance(work, step)
             moved: dict[str, float] = {}
-            if self._options.calibrate != "none" and step >= first_sweep:
+            fixed = self._options.calibrate == "none" or (self._decision and self._decision.model == "none")
+            if not fixed and step >= first_sweep:
                 moved = self._sweep(here, descent)
                 packed = self._corrected(here.nominal).packed()
             if drifting and step >= first_sweep:
@@ -218,6 +225,32 @@ class _Run:
         self._splats = descent.splats
         self._normals = self._accumulate(here, descent)
         self._timings[f"binning_{here.factor}"] = time.monotonic() - began
+
+    def gate(self, here: Level) -> Generator[Progress, None, None]:
+        """Before the finest level: how freely views may move from here on."""
+        if self._options.calibrate != "full" or self._options.gate == "off":
+            return
+        assert self._normals is not None
+        began, time_s = time.monotonic(), self._scan.time_s
+        moment = None if time_s is None else np.array(time_s)
+        self._decision = gate(
+            self._steady(here),
+            self._motions,
+            self._normals,
+            self._prior,
+            time=moment,
+            seed=self._options.seed,
+            threads=self._threads,
+        )
+        if self._decision.model == "full":
+            self._prior = narrowed(self._prior, self._motions, information(self._normals))
+        _, self._motions = settle(here.nominal, self._decision.motions)
+        self._timings["gate"] = time.monotonic() - began
+        yield self.progress("poses", self._decision.sentence(), level=here.factor)
+
+    def _steady(self, here: Level) -> Level:
+        """The level as if all views had been exposed alike."""
+        return replace(here, images=self._exposure.corrected(here.images))
 
     def _corrected(self, nominal: Frames) -> Frames:
         """Static part first, then every view's own."""
@@ -244,6 +277,8 @@ class _Run:
             limit = np.array([reach / self._radius] * 3 + [3 * reach] * 3)
             caution = 1.0 if here.factor == min(self._works) else _CAUTION
             motions, strain = step_full(normals, before, self._prior, limit, caution)
+            if self._decision is not None:
+                motions = self._decision.restrict(here.nominal, motions, normals)
             similarity, self._motions = settle(here.nominal, motions)
             stretched = (descent.splats.means @ (np.eye(3) + strain)).astype(np.float32)
             descent.replace(replace(descent.splats, means=stretched).moved(similarity))
@@ -272,6 +307,8 @@ class _Run:
         )
         if options.exposure:
             report["findings"].append(finding(self._exposure.offset))
+        if self._decision is not None:
+            report["findings"].append(self._decision.finding())
         self._timings["diagnose"] = time.monotonic() - began
         self._timings["total"] = time.monotonic() - self._began
         self._fraction = 1.0
@@ -296,10 +333,15 @@ class _Run:
 
     def _sigmas(self, corrected: Frames) -> tuple[Array, Array]:
         """Standard deviations of omega [views, 3] rad and tau [views, 3] mm; zero for what was not fitted."""
-        assert self._normals is not None
         if self._options.calibrate != "full":
             return np.zeros((len(corrected), 3)), np.zeros((len(corrected), 3))
-        omega, tau = sigmas(self._normals, self._prior)
+        assert self._splats is not None
+        here = self._steady(level(self._scan, min(self._works)))
+        huber = _HUBER * self._deviation or float(np.abs(here.images).max())
+        covariance = pose_covariance(
+            self._splats, self._corrected(here.nominal), here.images, here.mask, huber, self._prior, self._threads
+        )
+        omega, tau = np.split(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), 2, axis=1)
         if corrected.beam == "parallel":
             # A shift along the ray changes nothing, so any component that shares in it is unbounded.
             tau = np.where(np.abs(self._scan.frames.source) > 1e-3, np.inf, tau)

@@ -29,11 +29,13 @@ _RANGES = {
     "views": (1, 100_000), "det": (1, 32_768), "arc_deg": (1e-3, 36_000.0), "sigma_rot": (0.0, 10.0),
     "sigma_trans": (0.0, 1e4), "i0": (1.0, 1e15), "sigma_counts": (0.0, 1e15), "seed": (0, 2**63 - 1),
     "offset_px": (-1e5, 1e5), "roll_deg": (-360.0, 360.0), "tilt_deg": (-89.0, 89.0), "yaw_deg": (-89.0, 89.0),
-    "axis_pitch_deg": (-89.0, 89.0),
+    "axis_pitch_deg": (-89.0, 89.0), "drift_rot_deg": (0.0, 90.0), "drift_trans_vox": (0.0, 1e4),
 }  # fmt: skip
+_DRIFT_WAVES = 3  # half waves over the scan
 
 Noise = Literal["none", "r2", "physical"]
 Store = Literal["float32", "uint16"]
+DriftAxes = Literal["camera", "turntable"]
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,9 @@ class Simulation:
     flip_u: bool = False
     flip_v: bool = False
     store: Store = "float32"
+    drift_rot_deg: float = 0.0  # smooth motion over the scan, RMS of its angle
+    drift_trans_vox: float = 0.0  # and of its translation
+    drift_axes: DriftAxes = "camera"  # a part of the scanner drifts, or the object on its turntable
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():
@@ -70,6 +75,20 @@ class Simulation:
 def draw_motions(views: int, sigma_rot: float, sigma_trans_mm: float, rng: np.random.Generator) -> RigidMotions:
     """The paper's perturbation: independent normal rotation vectors (rad) and translations (mm), per axis."""
     return RigidMotions.exp(rng.normal(0, sigma_rot, (views, 3)), rng.normal(0, sigma_trans_mm, (views, 3)))
+
+
+def draw_drift(nominal: Frames, what: Simulation, voxel_mm: float, rng: np.random.Generator) -> RigidMotions:
+    """A smooth motion over the scan: every component a random sum of the first half waves, the n-th as large as 1/n.
+    Each has mean zero (a constant in camera axes is a static error), the whole the stated root mean square."""
+    views = len(nominal)
+    phase = np.pi * (np.arange(views) + 0.5) / views
+    waves = np.stack([np.cos(n * phase) / n for n in range(1, _DRIFT_WAVES + 1)], axis=1)
+    curve = waves @ rng.normal(size=(_DRIFT_WAVES, 6))
+    parts = []
+    for part, size in ((curve[:, :3], np.deg2rad(what.drift_rot_deg)), (curve[:, 3:], what.drift_trans_vox * voxel_mm)):
+        scaled = part * size / np.sqrt((part**2).sum(axis=1).mean())
+        parts.append(np.einsum("vji,vj->vi", nominal.axes(), scaled) if what.drift_axes == "camera" else scaled)
+    return RigidMotions.exp(*parts)
 
 
 def add_noise(line_integrals: Floats, noise: Noise, i0: float, sigma_counts: float, rng: np.random.Generator) -> Floats:
@@ -88,6 +107,8 @@ def add_noise(line_integrals: Floats, noise: Noise, i0: float, sigma_counts: flo
 def true_frames(nominal: Frames, what: Simulation, voxel_mm: float, rng: np.random.Generator) -> Frames:
     """Where source and detector really were: moved views on a scanner with static errors."""
     motions = draw_motions(what.views, what.sigma_rot, what.sigma_trans * voxel_mm, rng)
+    if what.drift_rot_deg or what.drift_trans_vox:
+        motions = draw_drift(nominal, what, voxel_mm, np.random.default_rng([what.seed, 2])) @ motions
     lean = RigidMotions(_turn(nominal.axes()[:, 0], what.axis_pitch_deg), np.zeros((what.views, 3)))
     off = nominal.shifted_detector(*what.offset_px)
     axes = off.axes()

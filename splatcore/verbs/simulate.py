@@ -18,6 +18,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--arc-deg", type=float, default=360.0)
     add("--sigma-rot", type=float, default=0.0, metavar="RAD", help="rotation error per axis and view")
     add("--sigma-trans", type=float, default=0.0, metavar="VOXELS", help="translation error per axis and view")
+    add("--drift-rot-deg", type=float, default=0.0, metavar="DEG", help="smooth rotation over the scan, RMS")
+    add("--drift-trans-vox", type=float, default=0.0, metavar="VOXELS", help="smooth translation over the scan, RMS")
+    add("--drift-axes", choices=["camera", "turntable"], default="camera", help="what drifts: a part of the scanner, "
+        "or the object on its turntable")  # fmt: skip
     add("--seed", type=int, default=0)
     add("--noise", choices=["none", "r2", "physical"], default="r2")
     add("--i0", type=float, default=1e4, help="photons per pixel in air")
@@ -50,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
         noise=args.noise, i0=args.i0, seed=args.seed, offset_px=tuple(args.true_offset_px), roll_deg=args.true_roll_deg,
         tilt_deg=args.true_tilt_deg, yaw_deg=args.true_yaw_deg, axis_pitch_deg=args.true_axis_pitch_deg,
         reverse=args.reverse, flip_u=args.flip_u, flip_v=args.flip_v, store=args.store,
+        drift_rot_deg=args.drift_rot_deg, drift_trans_vox=args.drift_trans_vox, drift_axes=args.drift_axes,
     )  # fmt: skip
     scan = simulate(load_volume(args.volume), args.out, what, args.threads or threads_allowed(), args.volume.stem)
     detector = scan["geometry"]["detector"]

@@ -11,7 +11,7 @@ import pytest
 from splatcore.errors import ResultError
 from splatcore.geometry import circular, rotation_from_vector
 from splatcore.scan import check_scan, read_scan
-from splatcore.simulate import Simulation, add_noise, draw_motions, load_volume, simulate, true_frames
+from splatcore.simulate import Simulation, add_noise, draw_drift, draw_motions, load_volume, simulate, true_frames
 
 from .phantom import phantom
 
@@ -28,6 +28,30 @@ def test_draws_are_unbiased_and_of_the_stated_width():
         assert np.abs(values.std(axis=0) / sigma - 1).max() < 4 / np.sqrt(2 * 20_000)
     correlation = np.corrcoef(np.concatenate([omega, tau], axis=1).T) - np.eye(6)
     assert np.abs(correlation).max() < 5 / np.sqrt(20_000)
+
+
+@pytest.mark.parametrize("axes", ["camera", "turntable"])
+def test_drift_is_smooth_in_its_axes_and_as_large_as_stated(axes):
+    frames, what = nominal(90), Simulation(views=90, drift_rot_deg=1.5, drift_trans_vox=2.0, drift_axes=axes)
+    omega, tau = draw_drift(frames, what, 1.5, np.random.default_rng(7)).vectors()
+    for part, size in ((omega, np.deg2rad(1.5)), (tau, 3.0)):
+        assert np.sqrt((part**2).sum(axis=1).mean()) == pytest.approx(size, rel=1e-6)
+        own = np.einsum("vij,vj->vi", frames.axes(), part) if axes == "camera" else part
+        assert np.abs(own.mean(axis=0)).max() < 1e-9  # a constant would be a static error
+        # Three half waves over 90 views: no step larger than 3 pi / 90 of the largest possible amplitude.
+        assert np.abs(np.diff(own, axis=0)).max() < 0.25 * size
+
+
+def test_drift_leaves_other_draws_alone():
+    frames, jitter = nominal(), Simulation(views=12, sigma_rot=0.02, sigma_trans=1.0, seed=3)
+    alone = true_frames(frames, jitter, 1.5, np.random.default_rng(3))
+    none = true_frames(frames, replace(jitter, drift_axes="turntable"), 1.5, np.random.default_rng(3))
+    assert np.array_equal(alone.source, none.source)
+    drift = replace(jitter, drift_rot_deg=1.0, drift_trans_vox=1.0)
+    both = true_frames(frames, drift, 1.5, np.random.default_rng(3))
+    motions = draw_motions(12, 0.02, 1.5, np.random.default_rng(3))
+    expected = (draw_drift(frames, drift, 1.5, np.random.default_rng([3, 2])) @ motions).correct(frames)
+    assert np.allclose(both.source, expected.source) and not np.allclose(both.source, alone.source)
 
 
 def test_r2_noise_has_the_stated_mean_and_width():
