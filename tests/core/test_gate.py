@@ -132,7 +132,7 @@ def test_too_few_views_are_not_judged():
     assert len(held) == 9 and len(set(held)) == 9 and held.min() >= 0 and held.max() < 75
     assert np.ptp(np.diff(held)) <= 1
     frames = circular("cone", np.arange(12) * 30.0, 500, 700, 32, 32, (8.0, 8.0))
-    here = Level(1, frames, np.zeros((12, 32, 32), np.float32), None, VolumeGrid((8, 8, 8), (10.0, 10.0, 10.0)))
+    here = Level(1, (1, 1), frames, np.zeros((12, 32, 32), np.float32), None, VolumeGrid((8, 8, 8), (10.0, 10.0, 10.0)))
     nothing = Normals(np.zeros((12, 12, 12)), np.zeros((12, 12)), *np.ones((4, 12)))
     motions = RigidMotions.identity(12)
     decision = gate(here, motions, nothing, PRIOR)
