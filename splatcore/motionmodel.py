@@ -32,6 +32,7 @@ _VIEWS_PER_SEGMENT = 3
 _PRICE = 1.4
 _SOFTEST, _STIFFEST = -4, 8  # powers of ten of the penalty, relative to the information of one segment's views
 _ROUNDS = 4
+_UNSEEN = 1e-13  # share of the best-seen parameter's information (1/rad^2 beside 1/mm^2) below which one is not seen
 
 
 @dataclass(frozen=True)
@@ -101,8 +102,11 @@ def _fit(
     right = np.einsum("vij,vi->j", weighted, poses)
     total = float(np.einsum("vi,vij,vj->", poses, information, poses))
     seen = 6 * int(np.count_nonzero(np.trace(information, axis1=1, axis2=2) > 0))
-    # Components differ in unit and in how well they are seen: each is scaled to unit information.
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    # Components differ in unit and in how well they are seen: each is scaled to unit information. What no view shows
+    # (with a line detector, all that leaves its plane) stays zero.
+    diagonal = np.diag(normal)
+    seen_at_all = diagonal > _UNSEEN * diagonal.max()
+    scale = np.where(seen_at_all, 1 / np.sqrt(np.where(seen_at_all, diagonal, 1.0)), 0.0)
     normal, right = scale[:, None] * normal * scale, scale * right
     roughness = _roughness(axes, basis.shape[1], scale)
 
@@ -165,6 +169,6 @@ def _roughness(axes: Axes | None, count: int, scale: Array) -> Array:
     roughness = np.zeros((6, len(scale), len(scale)))
     for component in range(6):
         part = slice(component * count, (component + 1) * count)
-        own = scale[part] / np.median(scale[part])
+        own = scale[part] / (np.median(scale[part]) or 1.0)
         roughness[component, part, part] = own[:, None] * (difference.T @ difference) * own
     return roughness

@@ -129,3 +129,14 @@ def test_time_counts_and_not_page_order():
         FRAMES[order], RigidMotions(found.rotation[order], found.translation[order]), EQUAL, TIME[order]
     )
     assert np.allclose(vectors_of(shuffled.motions), vectors_of(plain.motions)[order], atol=1e-7)
+
+
+@pytest.mark.parametrize("fit", [constant_motion, smooth_motion])
+def test_what_no_view_shows_stays_zero(fit):
+    """A fan beam: information about the turn about z and the shifts in x and y alone, zero but for rounding else."""
+    flat = np.diag([0.0, 0, 1, 1, 1, 0]) @ EQUAL + 1e-18 * np.random.default_rng(2).normal(size=EQUAL.shape)
+    true = wave() * [0, 0, 1, 1, 1, 0] + 2 * SIGMA * [0, 0, 1, 1, 1, 0]
+    curve = vectors_of(fit(FRAMES, motions(true), flat).motions)
+    assert np.abs(curve[:, [0, 1, 5]]).max() < 1e-9
+    if fit is smooth_motion:
+        assert np.abs(curve - true).max() < 0.3 * np.abs(true).max()
