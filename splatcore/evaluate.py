@@ -37,7 +37,7 @@ def evaluate(results: Path | str, truth: Path | str, threads: int | None = None)
     of the scan's own frames, before any calibration. Raises ScanError, ResultError.
     """
     found = read_results(results)
-    header, volume, unit, frames = _truth(Path(truth))
+    header, volume, unit, frames = read_truth(Path(truth))
     for what, true, ours in (
         ("volume_file", volume.shape, found.volume.shape),
         ("frames", len(frames), len(found.frames)),
@@ -54,13 +54,13 @@ def evaluate(results: Path | str, truth: Path | str, threads: int | None = None)
         "ssim_aligned": ssim(moved, volume, unit),
     }
     for suffix, estimated in (("", found.frames), ("_aligned", aligned)):
-        for name, value in _pose_scores(frames, estimated, found.grid).items():
+        for name, value in pose_scores(frames, estimated, found.grid).items():
             scores[name + suffix] = value
-    nominal = _pose_scores(frames, header.frames, found.grid)
+    nominal = pose_scores(frames, header.frames, found.grid)
     return {**scores, "nominal": nominal, "seconds": found.manifest["timings"].get("total"), "scan": header.name}
 
 
-def _pose_scores(true: Frames, estimated: Frames, grid: VolumeGrid) -> dict[str, float]:
+def pose_scores(true: Frames, estimated: Frames, grid: VolumeGrid) -> dict[str, float]:
     """RMS over views of the angle and the length of T_true^-1 T_est, and of a lattice's distance on the detector."""
     omega, tau = pose_errors(true, estimated).vectors()
     lattice = _lattice(grid)
@@ -79,8 +79,10 @@ def _lattice(grid: VolumeGrid) -> Array:
     return points * grid.half_extent_mm() + np.array(grid.center_mm)
 
 
-def _truth(folder: Path) -> tuple[ScanHeader, Floats, float, Frames]:
-    """The scan's header, its true volume [z, y, x] 1/mm, the attenuation that counts as 1, and its true frames."""
+def read_truth(folder: Path) -> tuple[ScanHeader, Floats, float, Frames]:
+    """The scan's header, its true volume [z, y, x] 1/mm, the attenuation that counts as 1, and its true frames.
+
+    Raises ScanError where the scan carries no truth."""
     header = read_header(folder)
     doc, simulation = Document(), header.simulation
     if simulation is None:

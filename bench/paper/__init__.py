@@ -1,0 +1,1 @@
+"""The comparison with the paper, and with other methods, in one command: `python -m bench.paper --help`."""
