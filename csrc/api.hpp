@@ -63,9 +63,11 @@ class Renderer {
   // (1 - dssim) mean huber(I - target) + dssim (1 - mean SSIM) / 2, and its gradient; huber(r) is
   // r^2 / (2 delta) up to |r| = delta, |r| - delta / 2 beyond.
   // mask [rows, cols], may be null: weights the pixels of the first term, multiplies image and target of the
-  // second. data_range scales SSIM's constants. v_motion as in render_vjp. Returns the loss.
+  // second. data_range scales SSIM's constants. v_motion as in render_vjp; v_center [count, 2], may be null:
+  // overwrites with dL/d(projected column, row) in 1/px. Returns the loss.
   virtual double loss_vjp(const FrameIn&, const SplatsIn<T>&, const T* target, const T* mask, double huber_delta,
-                          double dssim, double data_range, const SplatsOut<T>& v, double* v_motion = nullptr) = 0;
+                          double dssim, double data_range, const SplatsOut<T>& v, double* v_motion = nullptr,
+                          T* v_center = nullptr) = 0;
   // Gauss-Newton sums of a view, without ever holding a whole derivative image.
   virtual MotionNormal motion_normal(const FrameIn&, const SplatsIn<T>&, const T* target, const T* mask,
                                      double huber_delta) = 0;

@@ -37,6 +37,8 @@ using Out3 = nb::ndarray<T, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 template <class T>
 using OutRows3 = nb::ndarray<T, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 template <class T>
+using OutRows2 = nb::ndarray<T, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+template <class T>
 using OutRows4 = nb::ndarray<T, nb::shape<-1, 4>, nb::c_contig, nb::device::cpu>;
 // source (or ray), detector centre, u, v
 using Frame = nb::ndarray<const double, nb::shape<4, 3>, nb::c_contig, nb::device::cpu>;
@@ -144,20 +146,23 @@ void bind(nb::module_& m, const char* renderer_name) {
           "loss_vjp",
           [](R& self, Frame frame, bool cone, Rows3<T> means, Rows3<T> scales, Rows4<T> quats, In1<T> density,
              In2<T> target, MaybeImage<T> mask, double huber_delta, double dssim, double data_range, OutRows3<T> v_means,
-             OutRows3<T> v_scales, OutRows4<T> v_quats, Out1<T> v_density, std::optional<Motion> v_motion) {
+             OutRows3<T> v_scales, OutRows4<T> v_quats, Out1<T> v_density, std::optional<Motion> v_motion,
+             std::optional<OutRows2<T>> v_center) {
             const auto splats = splats_in<T>(means, scales, quats, density);
             const auto out = splats_out<T>(splats.count, v_means, v_scales, v_quats, v_density);
             require(huber_delta > 0, "huber_delta must be positive");
+            require(!v_center || v_center->shape(0) == means.shape(0), "v_center must be of the splats' number");
             const T *want = self.image(target), *on = self.maybe(mask);
             const auto f = frame_in(frame, cone);
             nb::gil_scoped_release release;
             return (*self).loss_vjp(f, splats, want, on, huber_delta, dssim, data_range, out,
-                                    v_motion ? v_motion->data() : nullptr);
+                                    v_motion ? v_motion->data() : nullptr, v_center ? v_center->data() : nullptr);
           },
           "frame"_a.noconvert(), "cone"_a, "means"_a.noconvert(), "scales"_a.noconvert(), "quats"_a.noconvert(),
           "density"_a.noconvert(), "target"_a.noconvert(), "mask"_a.noconvert().none(), "huber_delta"_a, "dssim"_a,
-          "data_range"_a, "v_means"_a.noconvert(), "v_scales"_a.noconvert(), "v_quats"_a.noconvert(), "v_density"_a.noconvert(),
-          "v_motion"_a.noconvert().none() = nb::none())
+          "data_range"_a, "v_means"_a.noconvert(), "v_scales"_a.noconvert(), "v_quats"_a.noconvert(),
+          "v_density"_a.noconvert(), "v_motion"_a.noconvert().none() = nb::none(),
+          "v_center"_a.noconvert().none() = nb::none())
       .def(
           "motion_normal",
           [](R& self, Frame frame, bool cone, Rows3<T> means, Rows3<T> scales, Rows4<T> quats, In1<T> density,

@@ -38,17 +38,19 @@ void adam(const AdamState<T>& s, const SplatsOut<T>& g, const AdamRates& r, int 
     for (int64_t i = 3 * from; i < 3 * to; ++i) s.means[i] -= mean * terms.move(g.means[i], m1[i], v1[i]);
 #pragma omp simd
     for (int64_t i = 4 * from; i < 4 * to; ++i) s.quats[i] -= quat * terms.move(g.quats[i], m3[i], v3[i]);
+#pragma omp simd
     for (int64_t i = 3 * from; i < 3 * to; ++i) {
       const T raw = s.log_scales[i] - log_scale * terms.move(g.scales[i] * s.scales[i], m2[i], v2[i]);
-      s.log_scales[i] = raw < low ? low : (raw > high ? high : raw);
+      s.log_scales[i] = min_of(max_of(raw, low), high);
       s.scales[i] = exp_of(s.log_scales[i]);
     }
+#pragma omp simd
     for (int64_t i = from; i < to; ++i) {
       // density = unit ln(1 + e^raw), so d density / d raw = unit (1 - e^(-density / unit))
       const T slope = unit * (T(1) - exp_of(-s.density[i] / unit));
       const T raw = s.raw_density[i] - density * terms.move(g.density[i] * slope, m4[i], v4[i]);
       s.raw_density[i] = raw;
-      s.density[i] = unit * (raw > T(20) ? raw : log1p(exp_of(raw)));
+      s.density[i] = unit * (max_of(raw, T(0)) + log1p_of(exp_of(-max_of(raw, -raw))));
     }
   }
 }

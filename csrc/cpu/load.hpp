@@ -7,53 +7,65 @@
 namespace splat {
 inline namespace SPLAT_NS {
 
-// Splats first .. first + N - 1 as one pack; past the end the last one is repeated.
+template <class P, class T>
+SPLAT_HD Gaussian<P> from_arrays(const T* means, const T* scales, const T* quats, const T* density) {
+  P mean[3], scale[3], quat[4];
+  from_records(means, mean);
+  from_records(scales, scale);
+  from_records(quats, quat);
+  return {{mean[0], mean[1], mean[2]},
+          {scale[0], scale[1], scale[2]},
+          {quat[0], quat[1], quat[2], quat[3]},
+          P::load(density)};
+}
+
+// Splats index(0) .. index(N - 1) as one pack.
+template <class P, class Index>
+SPLAT_HD Gaussian<P> load_each(const SplatsIn<typename P::Scalar>& s, Index index) {
+  using T = typename P::Scalar;
+  T means[3 * P::size], scales[3 * P::size], quats[4 * P::size], density[P::size];
+  for (int i = 0; i < P::size; ++i) {
+    const int64_t n = index(i);
+    for (int k = 0; k < 3; ++k) means[3 * i + k] = s.means[3 * n + k];
+    for (int k = 0; k < 3; ++k) scales[3 * i + k] = s.scales[3 * n + k];
+    for (int k = 0; k < 4; ++k) quats[4 * i + k] = s.quats[4 * n + k];
+    density[i] = s.density[n];
+  }
+  return from_arrays<P>(means, scales, quats, density);
+}
+
+// Splats first .. first + N - 1; past the end the last one is repeated.
 template <class P>
 SPLAT_HD Gaussian<P> load_pack(const SplatsIn<typename P::Scalar>& s, int64_t first) {
-  using T = typename P::Scalar;
-  Gaussian<P> g;
-  if (first + P::size <= s.count) {
-    const T* mean = s.means + 3 * first;
-    g.mean = {P::gather(mean, 3), P::gather(mean + 1, 3), P::gather(mean + 2, 3)};
-    for (int k = 0; k < 3; ++k) g.scale[k] = P::gather(s.scales + 3 * first + k, 3);
-    for (int k = 0; k < 4; ++k) g.quat[k] = P::gather(s.quats + 4 * first + k, 4);
-    g.density = P::load(s.density + first);
-    return g;
-  }
-  for (int i = 0; i < P::size; ++i) {
-    const int64_t n = first + i < s.count ? first + i : s.count - 1;
-    g.mean.x.v[i] = s.means[3 * n];
-    g.mean.y.v[i] = s.means[3 * n + 1];
-    g.mean.z.v[i] = s.means[3 * n + 2];
-    for (int k = 0; k < 3; ++k) g.scale[k].v[i] = s.scales[3 * n + k];
-    for (int k = 0; k < 4; ++k) g.quat[k].v[i] = s.quats[4 * n + k];
-    g.density.v[i] = s.density[n];
-  }
-  return g;
+  if (first + P::size <= s.count)
+    return from_arrays<P>(s.means + 3 * first, s.scales + 3 * first, s.quats + 4 * first, s.density + first);
+  return load_each<P>(s, [&](int i) { return first + i < s.count ? first + i : s.count - 1; });
 }
 
-template <class P>
-SPLAT_HD void store_pack(const SplatsOut<typename P::Scalar>& out, int64_t first, int64_t count, const Vec3<P>& mean,
-                         const P scale[3], const P quat[4], const P& density) {
-  const int64_t n = count - first < P::size ? count - first : P::size;
-  for (int64_t i = 0; i < n; ++i) {
-    const int64_t j = first + i;
-    out.means[3 * j] = mean.x.v[i];
-    out.means[3 * j + 1] = mean.y.v[i];
-    out.means[3 * j + 2] = mean.z.v[i];
-    for (int k = 0; k < 3; ++k) out.scales[3 * j + k] = scale[k].v[i];
-    for (int k = 0; k < 4; ++k) out.quats[4 * j + k] = quat[k].v[i];
-    out.density[j] = density.v[i];
-  }
+// `n` records of K numbers, n <= N.
+template <class T, int N, int K>
+SPLAT_HD void store_records(const Pack<T, N> (&in)[K], T* records, int n) {
+  if (n == N) return to_records(in, records);
+  T all[K * N];
+  to_records(in, all);
+  for (int i = 0; i < K * n; ++i) records[i] = all[i];
 }
 
-// A Gaussian that shows nowhere may have NaN for derivatives (it may lie in the source's plane): they become zero.
+// Writes the gradients of splats first .. first + n - 1. Those that are not `shown` may have NaN for derivatives (they
+// may lie in the source's plane): theirs become zero.
 template <class P>
-SPLAT_HD void clear_lane(GaussianGradient<P>& d, int lane) {
-  P* all[] = {&d.mean.x, &d.mean.y, &d.mean.z, &d.torque.x, &d.torque.y, &d.torque.z, &d.density};
-  for (P* p : all) p->v[lane] = 0;
-  for (P& p : d.scale) p.v[lane] = 0;
-  for (P& p : d.quat) p.v[lane] = 0;
+SPLAT_HD void store_pack(const SplatsOut<typename P::Scalar>& out, int64_t first, int n,
+                         const GaussianGradient<P>& d, typename P::Mask shown) {
+  const P zero(typename P::Scalar(0));
+  auto keep = [&](P v) { return select(shown, v, zero); };
+  const P mean[3] = {keep(d.mean.x), keep(d.mean.y), keep(d.mean.z)};
+  const P scale[3] = {keep(d.scale[0]), keep(d.scale[1]), keep(d.scale[2])};
+  const P quat[4] = {keep(d.quat[0]), keep(d.quat[1]), keep(d.quat[2]), keep(d.quat[3])};
+  const P density[1] = {keep(d.density)};
+  store_records(mean, out.means + 3 * first, n);
+  store_records(scale, out.scales + 3 * first, n);
+  store_records(quat, out.quats + 4 * first, n);
+  store_records(density, out.density + first, n);
 }
 
 }  // namespace SPLAT_NS

@@ -96,10 +96,9 @@ void voxelize_vjp(const GridIn& grid, const SplatsIn<T>& splats, const T* v_volu
       m.one.v[l] = t.one, m.x.v[l] = t.x, m.y.v[l] = t.y, m.z.v[l] = t.z, m.xx.v[l] = t.xx;
       m.yy.v[l] = t.yy, m.zz.v[l] = t.zz, m.xy.v[l] = t.xy, m.xz.v[l] = t.xz, m.yz.v[l] = t.yz;
     }
-    GaussianGradient<P> d = blob_vjp(g, m);
-    for (int l = 0; l < n; ++l)
-      if (blob[l].i0 > blob[l].i1) clear_lane(d, l);
-    store_pack<P>(v, first, splats.count, d.mean, d.scale, d.quat, d.density);
+    P shown(T(0));
+    for (int l = 0; l < n; ++l) shown.v[l] = blob[l].i0 <= blob[l].i1;
+    store_pack<P>(v, first, n, blob_vjp(g, m), shown > zero);
   }
 }
 

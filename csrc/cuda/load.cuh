@@ -28,7 +28,7 @@ __device__ __forceinline__ void store_one(const SplatsOut<T>& out, int64_t n, co
 template <class T>
 __device__ __forceinline__ GaussianGradient<T> no_gradient() {
   const T zero(0);
-  return {{zero, zero, zero}, {zero, zero, zero}, {zero, zero, zero, zero}, zero, {zero, zero, zero}};
+  return {{zero, zero, zero}, {zero, zero, zero}, {zero, zero, zero, zero}, zero, {zero, zero, zero}, zero, zero};
 }
 
 // Adding floats in whatever order threads arrive gives other bits each time. Integers do not care: pixels and

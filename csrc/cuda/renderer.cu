@@ -30,7 +30,7 @@ stamp_kernel(View<T> view, SplatsIn<T> splats, int rows, int cols, Stamp<T>* sta
   const int64_t n = thread_index();
   if (n >= splats.count) return;
   const Projected<T> p = project(view, load_one(splats, n));
-  stamps[n] = make_stamp(p.foot, p.clearance, rows, cols);
+  stamps[n] = make_stamp<Lanes<T>>(p.foot, p.clearance, rows, cols);
 }
 
 template <class T>
@@ -82,7 +82,9 @@ gather_kernel(const Stamp<T>* stamps, int64_t count, int rows, int cols, const T
   if (n >= count) s.x1 = s.x0 - 1;  // stays for the sums over lanes, which need the whole warp
   GatherMoments<Lanes<T>, T, ReadPixels<T>> gather{{v_image, cols}};
   walk<Lanes<T>>(s, 0, rows, gather);
-  const Moments<T> m = gather.total();
+  using L = Lanes<T>;
+  const Moments<T> m{L::sum(gather.one), L::sum(gather.x),  L::sum(gather.y),
+                     L::sum(gather.xx),  L::sum(gather.xy), L::sum(gather.yy)};
   if (n < count && (threadIdx.x & (kLanes - 1)) == 0) moments[n] = m;
 }
 
@@ -94,7 +96,7 @@ reverse_kernel(View<T> view, SplatsIn<T> splats, const Stamp<T>* stamps, const M
   const int64_t n = thread_index();
   GaussianGradient<T> d = no_gradient<T>();
   if (n < splats.count) {
-    if (stamps[n].x0 <= stamps[n].x1) {
+    if (shows(stamps[n])) {
       const Gaussian<T> g = load_one(splats, n);
       d = project_vjp(view, g, project(view, g), moments[n]);
     }
@@ -207,8 +209,7 @@ void CudaRenderer<T>::render_vjp(const FrameIn& frame, const SplatsIn<T>& splats
   double* partial = partial_.reserve(6 * static_cast<size_t>(blocks));
   stamp_kernel<<<blocks, kThreads, 0, stream_>>>(view, splats, rows_, cols_, stamps);
   gather_kernel<<<blocks_for(splats.count * kLanes), kThreads, 0, stream_>>>(
-      stamps, splats.count, rows_, cols_, v_image,
-                                                                            moments);
+      stamps, splats.count, rows_, cols_, v_image, moments);
   reverse_kernel<<<blocks, kThreads, 0, stream_>>>(view, splats, stamps, moments, v, partial);
   if (v_motion) motion_kernel<<<1, 6, 0, stream_>>>(partial, blocks, v_motion);
   check(cudaGetLastError(), "render_vjp");

@@ -88,7 +88,7 @@ SPLAT_HD Blob<T> make_blob(const GridIn& grid, const BlobShape<T>& s, T density)
   return b;
 }
 
-// Calls visit(row, i, dx, dy, dz, e) for every `width` voxels (row + i + lane) of the blob in slices [from, to):
+// Calls visit(row, i, dx, dy, dz, e) for every `count` voxels (row + i + lane) of the blob in slices [from, to):
 // e is the unit-density value, zero beyond the cutoff; dx, dy, dz count voxels.
 template <class L, class T, class Visit>
 SPLAT_HD void walk_blob(const GridIn& grid, const Blob<T>& b, int from, int to, Visit& visit) {
@@ -104,7 +104,7 @@ SPLAT_HD void walk_blob(const GridIn& grid, const Blob<T>& b, int from, int to, 
       // The row's best value is flat - lean^2 / (4 ii); below the cutoff the row is skipped.
       if (flat - lean * lean / (4 * s.ii) < limit) continue;
       const long row = (static_cast<long>(k) * grid.ny + j) * grid.nx;
-      for (int i = b.i0; i <= b.i1; i += L::width) {
+      for (int i = b.i0; i <= b.i1; i += L::count) {
         const V dx = L::index() + V(T(i) - s.i);
         const V power = V(flat) + dx * (V(lean) + V(s.ii) * dx);
         visit(row, i, dx, dy, dz, select(power > V(limit), exp2_of(power), V(T(0))));

@@ -40,6 +40,7 @@ struct Projected {
   Vec3<T> j0, j1;        // gradients of column and row, px/mm
   T column_rel, row_rel; // before the detector's centre is added
   T inverse_depth;       // 1/q2
+  Vec3<T> spread;        // change of q2 along the half axes (cone)
   T clearance;           // q2 less four standard deviations of it; below 0 the Gaussian reaches the source's plane
   Vec3<T> t0, t1;        // rows of T = J2 M, px
   Vec3<T> w0, w1;        // rows of W = S^-1 T, 1/px
@@ -71,8 +72,8 @@ SPLAT_HD Projected<T> project(const View<T>& view, const Gaussian<T>& g) {
   for (int k = 0; k < 3; ++k) p.half_axis[k] = g.scale[k] * p.axes.column[k];
   p.clearance = T(1);
   if (view.cone) {
-    const Vec3<T> spread{dot(view.k2, p.half_axis[0]), dot(view.k2, p.half_axis[1]), dot(view.k2, p.half_axis[2])};
-    p.clearance = dot(view.k2, p.offset) - T(4) * sqrt_of(dot(spread, spread));
+    p.spread = {dot(view.k2, p.half_axis[0]), dot(view.k2, p.half_axis[1]), dot(view.k2, p.half_axis[2])};
+    p.clearance = dot(view.k2, p.offset) - T(4) * sqrt_of(dot(p.spread, p.spread));
   }
   p.t0 = {dot(p.j0, p.half_axis[0]), dot(p.j0, p.half_axis[1]), dot(p.j0, p.half_axis[2])};
   p.t1 = {dot(p.j1, p.half_axis[0]), dot(p.j1, p.half_axis[1]), dot(p.j1, p.half_axis[2])};
@@ -106,6 +107,7 @@ struct GaussianGradient {
   T quat[4];
   T density;
   Vec3<T> torque;  // dL/domega of this Gaussian; dL/dtau is `mean`
+  T column, row;   // dL/d(projected centre), per px
 };
 
 template <class T>
@@ -116,6 +118,8 @@ SPLAT_HD GaussianGradient<T> project_vjp(const View<T>& view, const Gaussian<T>&
   const T amplitude = f.amplitude;
   const T v_column = amplitude * (f.a * m.x + f.b * m.y);
   const T v_row = amplitude * (f.b * m.x + f.c * m.y);
+  v.column = v_column;
+  v.row = v_row;
   v.density = m.one * p.per_density;
   // With Q = S^-1 and M2 the second moments: dL/dS = amplitude (Q M2 Q - one Q) / 2, of which the first term is the
   // footprint's shape and the second the amplitude's 1/sqrt(det S); so dL/dT = 2 dL/dS T = amplitude (Q M2 - one) W.
@@ -154,49 +158,66 @@ inline constexpr int kRigid = 6;      // 0..2 omega (rotation vector, rad), 3..5
 inline constexpr int kDirections = 12;  // 6..11 strain xx, yy, zz, yz, xz, xy of the means, x -> x + E x
 
 template <class T>
-SPLAT_HD Vec3<T> mean_velocity(const Vec3<T>& mean, int direction) {
-  const T zero(0), one(1);
-  const int axis = direction % 3;
-  const Vec3<T> unit{axis == 0 ? one : zero, axis == 1 ? one : zero, axis == 2 ? one : zero};
-  if (direction < 3) return cross(unit, mean);
-  if (direction < 6) return unit;
-  if (direction < 9) return {unit.x * mean.x, unit.y * mean.y, unit.z * mean.z};
-  return {unit.z * mean.y + unit.y * mean.z, unit.z * mean.x + unit.x * mean.z, unit.y * mean.x + unit.x * mean.y};
+SPLAT_HD Moments<T> operator*(T s, const Moments<T>& a) {
+  return {s * a.one, s * a.x, s * a.y, s * a.xx, s * a.xy, s * a.yy};
+}
+template <class T>
+SPLAT_HD Moments<T> operator+(const Moments<T>& a, const Moments<T>& b) {
+  return {a.one + b.one, a.x + b.x, a.y + b.y, a.xx + b.xx, a.xy + b.xy, a.yy + b.yy};
 }
 
-// d(footprint value)/d(direction) = value * (one + x dx + y dy + xx dx^2 + xy dx dy + yy dy^2).
+// d(footprint value) = value * (one + x dx + y dy + xx dx^2 + xy dx dy + yy dy^2) along all directions. Everything is
+// linear in the velocity of the mean and in the turn of the half axes, so six derivatives make all twelve.
+//
+// With Y = dT W': dS = dT T' + T dT', dQ = -Q dS Q = -(Q Y + (Q Y)'), d ln amplitude = d ln det J - tr Y.
 template <class T>
-SPLAT_HD Moments<T> motion_derivative(const View<T>& view, const Gaussian<T>& g, const Projected<T>& p, int direction) {
-  const T zero(0), one(1);
-  const Vec3<T> unit{direction == 0 ? one : zero, direction == 1 ? one : zero, direction == 2 ? one : zero};
-  const bool turn = direction < 3;
-  const Vec3<T> d_mean = mean_velocity(g.mean, direction);
-  const T d_column = dot(p.j0, d_mean), d_row = dot(p.j1, d_mean);
-  Vec3<T> d_j0{zero, zero, zero}, d_j1{zero, zero, zero};
-  T d_log(0);  // of det J
-  if (view.cone) {
-    const T d_depth = dot(view.k2, d_mean) * p.inverse_depth;  // relative
-    d_j0 = -d_depth * p.j0 - (d_column * p.inverse_depth) * view.k2;
-    d_j1 = -d_depth * p.j1 - (d_row * p.inverse_depth) * view.k2;
-    d_log = dot(p.offset, d_mean) / dot(p.offset, p.offset) - T(3) * d_depth;
-  }
-  Vec3<T> d_half[3] = {{zero, zero, zero}, {zero, zero, zero}, {zero, zero, zero}};
-  for (int k = 0; turn && k < 3; ++k) d_half[k] = cross(unit, p.half_axis[k]);
-  Vec3<T> d_t0{dot(d_j0, p.half_axis[0]) + dot(p.j0, d_half[0]), dot(d_j0, p.half_axis[1]) + dot(p.j0, d_half[1]),
-               dot(d_j0, p.half_axis[2]) + dot(p.j0, d_half[2])};
-  Vec3<T> d_t1{dot(d_j1, p.half_axis[0]) + dot(p.j1, d_half[0]), dot(d_j1, p.half_axis[1]) + dot(p.j1, d_half[1]),
-               dot(d_j1, p.half_axis[2]) + dot(p.j1, d_half[2])};
-  // With Y = dT W': dS = dT T' + T dT', dQ = -Q dS Q = -(Q Y + (Q Y)'), d ln amplitude = d ln det J - tr Y.
-  const T y00 = dot(d_t0, p.w0), y01 = dot(d_t0, p.w1), y10 = dot(d_t1, p.w0), y11 = dot(d_t1, p.w1);
+SPLAT_HD Moments<T> shape_derivative(const Footprint<T>& f, T y00, T y01, T y10, T y11) {
+  return {-(y00 + y11), T(0),
+          T(0),         f.a * y00 + f.b * y10,
+          f.a * y01 + f.b * (y00 + y11) + f.c * y10, f.b * y01 + f.c * y11};
+}
+
+template <class T>
+SPLAT_HD void motion_derivatives(const View<T>& view, const Gaussian<T>& g, const Projected<T>& p,
+                                 Moments<T> d[kDirections]) {
   const Footprint<T>& f = p.foot;
-  Moments<T> d;
-  d.one = d_log - (y00 + y11);
-  d.x = f.a * d_column + f.b * d_row;
-  d.y = f.b * d_column + f.c * d_row;
-  d.xx = f.a * y00 + f.b * y10;
-  d.xy = f.a * y01 + f.b * (y00 + y11) + f.c * y10;
-  d.yy = f.b * y01 + f.c * y11;
-  return d;
+  // The mean along x, y, z. Cone: dT = -(relative change of q2) T - (change of column, row) / q2 spread', and T W' = 1.
+  const T j0[3] = {p.j0.x, p.j0.y, p.j0.z}, j1[3] = {p.j1.x, p.j1.y, p.j1.z};
+  const T k2[3] = {view.k2.x, view.k2.y, view.k2.z}, ray[3] = {p.offset.x, p.offset.y, p.offset.z};
+  Moments<T> shift[3];
+  T lean0(T(0)), lean1(T(0)), per_square(T(0));
+  if (view.cone) {
+    lean0 = p.inverse_depth * dot(p.spread, p.w0);
+    lean1 = p.inverse_depth * dot(p.spread, p.w1);
+    per_square = T(1) / dot(p.offset, p.offset);
+  }
+  for (int k = 0; k < 3; ++k) {
+    if (view.cone) {
+      const T nearer = k2[k] * p.inverse_depth;
+      shift[k] = shape_derivative(f, -nearer - j0[k] * lean0, -j0[k] * lean1, -j1[k] * lean0, -nearer - j1[k] * lean1);
+      shift[k].one += ray[k] * per_square - T(3) * nearer;  // d ln det J
+    } else {
+      shift[k] = {T(0), T(0), T(0), T(0), T(0), T(0)};
+    }
+    shift[k].x += f.a * j0[k] + f.b * j1[k];
+    shift[k].y += f.b * j0[k] + f.c * j1[k];
+  }
+  // The half axes about x, y, z: dT = J dM, dM = unit x M, so Y_ij = unit . (M w_j x J_i).
+  Vec3<T> n0 = p.w0.x * p.half_axis[0], n1 = p.w1.x * p.half_axis[0];
+  n0 = n0 + p.w0.y * p.half_axis[1] + p.w0.z * p.half_axis[2];
+  n1 = n1 + p.w1.y * p.half_axis[1] + p.w1.z * p.half_axis[2];
+  const Vec3<T> y00 = cross(n0, p.j0), y01 = cross(n1, p.j0), y10 = cross(n0, p.j1), y11 = cross(n1, p.j1);
+  const T x = g.mean.x, y = g.mean.y, z = g.mean.z;
+  d[0] = shape_derivative(f, y00.x, y01.x, y10.x, y11.x) + y * shift[2] + (-z) * shift[1];
+  d[1] = shape_derivative(f, y00.y, y01.y, y10.y, y11.y) + z * shift[0] + (-x) * shift[2];
+  d[2] = shape_derivative(f, y00.z, y01.z, y10.z, y11.z) + x * shift[1] + (-y) * shift[0];
+  for (int k = 0; k < 3; ++k) d[3 + k] = shift[k];
+  d[6] = x * shift[0];
+  d[7] = y * shift[1];
+  d[8] = z * shift[2];
+  d[9] = z * shift[1] + y * shift[2];
+  d[10] = z * shift[0] + x * shift[2];
+  d[11] = y * shift[0] + x * shift[1];
 }
 
 }  // namespace SPLAT_NS
