@@ -12,6 +12,10 @@ inline namespace SPLAT_NS {
 
 inline constexpr int kSlab = 8;  // slices a slab
 
+// Blobs are about eight voxels wide: more lanes would idle.
+template <class T>
+using BlobLanes = PackLanes<T, (kLanesOf<T> < 8 ? kLanesOf<T> : 8)>;
+
 // Blobs of splats first .. first + n - 1, n <= P::size.
 template <class P, class T>
 SPLAT_HD void make_blobs(const GridIn& grid, const Gaussian<P>& g, int n, Blob<T>* out) {
@@ -19,14 +23,30 @@ SPLAT_HD void make_blobs(const GridIn& grid, const Gaussian<P>& g, int n, Blob<T
   for (int l = 0; l < n; ++l) {
     const BlobShape<T> one{s.i.v[l],  s.j.v[l],  s.k.v[l],  s.ii.v[l],      s.jj.v[l],      s.kk.v[l],
                            s.ij.v[l], s.ik.v[l], s.jk.v[l], s.reach_i.v[l], s.reach_j.v[l], s.reach_k.v[l]};
-    out[l] = make_blob(grid, one, g.density.v[l]);
+    out[l] = make_blob<BlobLanes<T>>(grid, one, g.density.v[l]);
   }
 }
 
 template <class T>
+struct AddBlob {
+  using V = typename BlobLanes<T>::Value;
+  T* volume;
+  int nx;
+  V density;
+  SPLAT_HD void enter() {}
+  SPLAT_HD void leave(V, T) {}
+  SPLAT_HD void operator()(long row, int i, T, V e) {
+    const V value = density * e;
+    T* at = volume + row + i;
+    if (i + V::size <= nx) return (V::load(at) + value).store(at);
+    for (int lane = 0; i + lane < nx; ++lane) at[lane] += value.v[lane];
+  }
+};
+
+template <class T>
 void voxelize(const GridIn& grid, const SplatsIn<T>& splats, T* volume, int threads) {
-  using L = PackLanes<T>;
-  using P = typename L::Value;
+  using P = typename PackLanes<T>::Value;   // splats
+  using V = typename BlobLanes<T>::Value;  // voxels
   const int slabs = (grid.nz + kSlab - 1) / kSlab;
   Buffer<Blob<T>> all;
   Blob<T>* blobs = all.reserve(splats.count);
@@ -57,15 +77,8 @@ void voxelize(const GridIn& grid, const SplatsIn<T>& splats, T* volume, int thre
     memset(volume + from * slice, 0, static_cast<size_t>(to - from) * slice * sizeof(T));
     for (int64_t n = start[s]; n < start[s + 1]; ++n) {
       const Blob<T>& b = blobs[order[n]];
-      auto add = [&](long row, int i, P, T, T, P e) {
-        const P value = P(b.density) * e;
-        if (i + P::size <= grid.nx) {
-          (P::load(volume + row + i) + value).store(volume + row + i);
-        } else {
-          for (int lane = 0; i + lane < grid.nx; ++lane) volume[row + i + lane] += value.v[lane];
-        }
-      };
-      walk_blob<L>(grid, b, from, to, add);
+      AddBlob<T> add{volume, grid.nx, V(b.density)};
+      walk_blob<BlobLanes<T>>(grid, b, from, to, add);
     }
   }
 }
@@ -73,11 +86,11 @@ void voxelize(const GridIn& grid, const SplatsIn<T>& splats, T* volume, int thre
 template <class T>
 void voxelize_vjp(const GridIn& grid, const SplatsIn<T>& splats, const T* v_volume, const SplatsOut<T>& v,
                   int threads) {
-  using L = PackLanes<T>;
-  using P = typename L::Value;
+  using P = typename PackLanes<T>::Value;   // splats
+  using V = typename BlobLanes<T>::Value;  // voxels
   auto read = [=, &grid](long row, int i) {
-    if (i + P::size <= grid.nx) return P::load(v_volume + row + i);
-    P tail(T(0));
+    if (i + V::size <= grid.nx) return V::load(v_volume + row + i);
+    V tail(T(0));
     for (int lane = 0; i + lane < grid.nx; ++lane) tail.v[lane] = v_volume[row + i + lane];
     return tail;
   };
@@ -90,8 +103,8 @@ void voxelize_vjp(const GridIn& grid, const SplatsIn<T>& splats, const T* v_volu
     const P zero(T(0));
     BlobMoments<P> m{zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
     for (int l = 0; l < n; ++l) {
-      GatherBlob<L, T, decltype(read)> gather{read};
-      walk_blob<L>(grid, blob[l], 0, grid.nz, gather);
+      GatherBlob<BlobLanes<T>, T, decltype(read)> gather{read};
+      walk_blob<BlobLanes<T>>(grid, blob[l], 0, grid.nz, gather);
       const BlobMoments<T> t = gather.total(grid);
       m.one.v[l] = t.one, m.x.v[l] = t.x, m.y.v[l] = t.y, m.z.v[l] = t.z, m.xx.v[l] = t.xx;
       m.yy.v[l] = t.yy, m.zz.v[l] = t.zz, m.xy.v[l] = t.xy, m.xz.v[l] = t.xz, m.yz.v[l] = t.yz;

@@ -126,7 +126,7 @@ __global__ void motion_kernel(const double* partial, int64_t blocks, double* v_m
 
 template <class T>
 __device__ __forceinline__ Blob<T> blob_of(const GridIn& grid, const Gaussian<T>& g) {
-  return make_blob(grid, blob_shape(grid, g), g.density);
+  return make_blob<Lanes<T>>(grid, blob_shape(grid, g), g.density);
 }
 
 template <class T>
@@ -134,7 +134,9 @@ struct AddVoxels {
   unsigned long long* sums;
   int nx;
   T density;
-  __device__ void operator()(long row, int i, T, T, T, T e) {
+  __device__ void enter() {}
+  __device__ void leave(T, T) {}
+  __device__ void operator()(long row, int i, T, T e) {
     const int at = i + (threadIdx.x & (kLanes - 1));
     if (at < nx) add_exactly(sums + row + at, density * e);
   }

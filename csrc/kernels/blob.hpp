@@ -60,6 +60,8 @@ template <class T>
 struct Blob {
   BlobShape<T> shape;
   T density;
+  T bend;                      // 2^(2 jj): the second ratio of values one row apart
+  int run;                     // rows from one exponential to the next, 1 .. kRun
   int i0, i1, j0, j1, k0, k1;  // inclusive bounds inside the volume; i0 > i1 where nothing shows
 };
 
@@ -73,8 +75,8 @@ SPLAT_HD void bound(T center, T reach, int n, int& low, int& high) {
   high = static_cast<int>(floor(right));
 }
 
-// Never NaN: a Gaussian outside the volume, without mass or not finite gives an empty blob.
-template <class T>
+// L: the lanes that will walk it. A Gaussian outside the volume, without mass or not finite gives an empty blob.
+template <class L, class T>
 SPLAT_HD Blob<T> make_blob(const GridIn& grid, const BlobShape<T>& s, T density) {
   Blob<T> b;
   b.shape = s;
@@ -85,30 +87,55 @@ SPLAT_HD Blob<T> make_blob(const GridIn& grid, const BlobShape<T>& s, T density)
   const bool finite = s.ii < T(0) && s.jj < T(0) && s.kk < T(0) && density != T(0) &&
                       (density + s.ii + s.jj + s.kk + s.i + s.j + s.k) * T(0) == T(0);
   if (b.j0 > b.j1 || b.k0 > b.k1 || !finite) b.i1 = b.i0 - 1;
+  // As for stamps: how far the exponent may rise from one row to the next.
+  const T growth = max_of(s.ij, -s.ij) * (s.reach_i + T(L::count)) + max_of(s.jk, -s.jk) * (s.reach_k + T(1)) -
+                   T(2) * s.jj * (s.reach_j + T(1));
+  b.run = static_cast<int>(min_of(T(1) + T(-kFloor - 12) / growth, T(kRun)));
+  b.bend = exp2_of(max_of(T(2) * s.jj, T(kFloor)));
   return b;
 }
 
-// Calls visit(row, i, dx, dy, dz, e) for every `count` voxels (row + i + lane) of the blob in slices [from, to):
-// e is the unit-density value, zero beyond the cutoff; dx, dy, dz count voxels.
+// Calls visit(row, i, dy, e) for every `count` voxels (row + i + lane) of the blob in slices [from, to): e is the
+// unit-density value, zero beyond the cutoff; dx, dy, dz count voxels from the centre. Each slice of a blob is a
+// footprint, walked down its rows as stamps are: by products, visit.enter() before the rows of a group of columns and
+// visit.leave(dx, dz) after them.
 template <class L, class T, class Visit>
 SPLAT_HD void walk_blob(const GridIn& grid, const Blob<T>& b, int from, int to, Visit& visit) {
   using V = typename L::Value;
   const T limit(-0.5 * kLog2E * kCutoff);
+  const V zero(T(0)), cutoff{T(kCutoffValue)}, lowest{T(kFloor)}, bend(b.bend);
   const BlobShape<T>& s = b.shape;
   const int k0 = b.k0 > from ? b.k0 : from, k1 = b.k1 < to - 1 ? b.k1 : to - 1;
+  // The best exponent of a row, over dx, is kk dz^2 + jk dz dy + jj dy^2 with these.
+  const T per = T(1) / (T(4) * s.ii), jj = s.jj - s.ij * s.ij * per, kk = s.kk - s.ik * s.ik * per;
+  const T jk = s.jk - T(2) * s.ij * s.ik * per;
   for (int k = k0; k <= k1; ++k) {
     const T dz = T(k) - s.k;
-    for (int j = b.j0; j <= b.j1; ++j) {
-      const T dy = T(j) - s.j;
-      const T flat = dz * (s.kk * dz + s.jk * dy) + s.jj * dy * dy, lean = s.ij * dy + s.ik * dz;
-      // The row's best value is flat - lean^2 / (4 ii); below the cutoff the row is skipped.
-      if (flat - lean * lean / (4 * s.ii) < limit) continue;
-      const long row = (static_cast<long>(k) * grid.ny + j) * grid.nx;
-      for (int i = b.i0; i <= b.i1; i += L::count) {
-        const V dx = L::index() + V(T(i) - s.i);
-        const V power = V(flat) + dx * (V(lean) + V(s.ii) * dx);
-        visit(row, i, dx, dy, dz, select(power > V(limit), exp2_of(power), V(T(0))));
+    int j0 = b.j0, j1 = b.j1;
+    if (j1 - j0 >= 2 * kRun) {  // many rows: those of this slice; else the branches cost more
+      const T middle = -jk * dz / (T(2) * jj);
+      const T room = (limit - (kk * dz + T(0.5) * jk * middle) * dz) / jj;  // half the slice's height, squared
+      if (!(room >= T(0))) continue;
+      bound(s.j + middle, sqrt_of(room), grid.ny, j0, j1);
+    }
+    for (int i = b.i0; i <= b.i1; i += L::count) {
+      const V dx = L::index() + V(T(i) - s.i);
+      const V along = V(s.kk * dz * dz) + dx * (V(s.ik * dz) + V(s.ii) * dx), mixed = V(s.ij) * dx + V(s.jk * dz);
+      visit.enter();
+      for (int j = j0; j <= j1;) {
+        const T dy = T(j) - s.j;
+        V value = exp2_of(max_of(along + V(dy) * (mixed + V(s.jj * dy)), lowest));
+        V ratio = exp2_of(max_of(mixed + V(s.jj * (dy + dy + T(1))), lowest));
+        const int stop = j1 < j + b.run - 1 ? j1 : j + b.run - 1;
+        for (;;) {
+          const long row = (static_cast<long>(k) * grid.ny + j) * grid.nx;
+          visit(row, i, T(j) - s.j, select(value > cutoff, value, zero));
+          if (++j > stop) break;
+          value *= ratio;
+          ratio *= bend;
+        }
       }
+      visit.leave(dx, dz);
     }
   }
 }
@@ -124,10 +151,18 @@ struct GatherBlob {
   using V = typename L::Value;
   Read read;  // read(row, i): the gradient at voxels row + i + lane, zero beyond the end of the row
   BlobMoments<V> m{V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0)), V(T(0))};
-  SPLAT_HD void operator()(long row, int i, V dx, T dy, T dz, V e) {
-    const V t = read(row, i) * e, tx = t * dx, ty = t * V(dy), tz = t * V(dz);
-    m.one += t, m.x += tx, m.y += ty, m.z += tz;
-    m.xx += tx * dx, m.yy += ty * V(dy), m.zz += tz * V(dz), m.xy += tx * V(dy), m.xz += tx * V(dz), m.yz += ty * V(dz);
+  V g0{T(0)}, g1{T(0)}, g2{T(0)};  // of the present columns: sums of G e times 1, dy, dy^2
+  SPLAT_HD void enter() { g0 = g1 = g2 = V(T(0)); }
+  SPLAT_HD void operator()(long row, int i, T dy, V e) {
+    const V g = read(row, i) * e, gy = g * V(dy);
+    g0 += g;
+    g1 += gy;
+    g2 += gy * V(dy);
+  }
+  SPLAT_HD void leave(V dx, T dz) {
+    const V gx = g0 * dx, gz = g0 * V(dz);
+    m.one += g0, m.x += gx, m.y += g1, m.z += gz;
+    m.xx += gx * dx, m.yy += g2, m.zz += gz * V(dz), m.xy += g1 * dx, m.xz += gz * dx, m.yz += g1 * V(dz);
   }
   // In mm.
   SPLAT_HD BlobMoments<T> total(const GridIn& grid) const {

@@ -10,11 +10,12 @@ inline namespace SPLAT_NS {
 
 // A footprint ends where dx'S^-1dx reaches this: at 4 standard deviations, 3.4e-4 of its peak.
 inline constexpr double kCutoff = 16.0;
+inline constexpr double kCutoffValue = 3.3546262790251185e-4;  // exp(-kCutoff / 2)
 
 inline constexpr double kLog2E = 1.4426950408889634;
 
 // Values of a column come from the one above by multiplications (see walk), and every so often afresh.
-inline constexpr int kRun = 8;          // tiles at most from one exponential to the next: rounding grows with the square
+inline constexpr int kRun = 8;          // tiles at most from one exponential to the next: errors grow with the square
 inline constexpr double kFloor = -120;  // exponents below are raised to it: 2^-120 is still a normal float
 
 // All fields are of one size, so that packs of stamps transpose into records: 64 bytes with floats, a line of cache.
@@ -84,7 +85,7 @@ template <class L, class T, class Visit>
 SPLAT_HD void walk(const Stamp<T>& s, int row_begin, int row_end, Visit& visit) {
   using V = typename L::Value;
   constexpr int h = L::height;
-  const V zero(T(0)), cutoff(T(3.3546262790251185e-4)), lowest{T(kFloor)}, step{T(h)};  // exp(-kCutoff / 2)
+  const V zero(T(0)), cutoff{T(kCutoffValue)}, lowest{T(kFloor)}, step{T(h)};
   const int x0 = static_cast<int>(s.x0), x1 = static_cast<int>(s.x1), run = static_cast<int>(s.run);
   const int top = static_cast<int>(s.y0), bottom = static_cast<int>(s.y1);
   const int begin = top > row_begin ? top : row_begin, end = bottom < row_end - 1 ? bottom : row_end - 1;
@@ -94,10 +95,11 @@ SPLAT_HD void walk(const Stamp<T>& s, int row_begin, int row_end, Visit& visit) 
       const T left = max_of(T(x) - s.column, -s.half_width);
       const T right = min_of(T(x + L::width - 1) - s.column, s.half_width);
       const T at_left = s.slope * left, at_right = s.slope * right;
-      const int first = static_cast<int>(ceil_of<T>(max_of(s.row + min_of(at_left, at_right) - s.half_height, T(top))));
-      const int final = static_cast<int>(floor_of<T>(min_of(s.row + max_of(at_left, at_right) + s.half_height, T(bottom))));
-      y = first > y ? first : y;
-      last = final < last ? final : last;
+      const T upper = max_of(s.row + min_of(at_left, at_right) - s.half_height, T(begin));
+      const T lower = min_of(s.row + max_of(at_left, at_right) + s.half_height, T(end));
+      if (!(upper <= lower)) continue;
+      y = static_cast<int>(ceil_of<T>(upper));
+      last = static_cast<int>(floor_of<T>(lower));
     }
     if (y > last) continue;
     y -= y % h;

@@ -212,7 +212,10 @@ SPLAT_HD Pack<T, N> nth_of_records(const Pack<T, N>* in, Pack<T, N> done) {
   if constexpr (s == K) {
     return done;
   } else {
-    constexpr auto pick = [](int i) { return (K * i + k) / N == s ? N + (K * i + k) % N : (s == 1 ? (K * i + k) % N : i); };
+    constexpr auto pick = [](int i) {
+      const int from = (K * i + k) / N, lane = (K * i + k) % N;
+      return from == s ? N + lane : (s == 1 ? lane : i);
+    };
     return nth_of_records<K, k, s + 1>(in, merge<pick>(done, in[s]));
   }
 }
@@ -233,7 +236,10 @@ SPLAT_HD Pack<T, N> nth_to_records(const Pack<T, N>* in, Pack<T, N> done) {
   if constexpr (k == K) {
     return done;
   } else {
-    constexpr auto pick = [](int l) { return (s * N + l) % K == k ? N + (s * N + l) / K : (k == 1 ? (s * N + l) / K : l); };
+    constexpr auto pick = [](int i) {
+      const int from = (s * N + i) % K, lane = (s * N + i) / K;
+      return from == k ? N + lane : (k == 1 ? lane : i);
+    };
     return nth_to_records<K, s, k + 1>(in, merge<pick>(done, in[k]));
   }
 }

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from splatcore import _native, ops
+from splatcore import _native, ops, reference
 from splatcore.geometry import Beam
 
 from ..tolerances import gradient_error
@@ -70,6 +72,28 @@ def test_loss_and_gradient(isa: str, beam: Beam, dssim: float, masked: bool) -> 
     assert loss == pytest.approx(expected.item(), rel=1e-12)
     for actual, twin in zip(gradients, torch.autograd.grad(expected, leaves), strict=True):
         assert gradient_error(actual, twin) < 1e-11
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
+@pytest.mark.parametrize("beam", ["cone", "parallel"])
+def test_gradient_of_the_projected_centres(isa: str, beam: Beam, dtype: torch.dtype) -> None:
+    """Against the twin with the centres as leaves of their own: footprints and amplitudes stay as they are."""
+    leaves, view, target, mask = scene(beam)
+    splats = [t.detach().to(dtype) for t in leaves]
+    foot = reference.footprints(*[t.double() for t in splats], NO_MOTION, view, beam == "cone", ROWS, COLS)
+    center = foot.center.requires_grad_()
+    m = replace(foot, center=center).squared_distance(ROWS, COLS)
+    values = torch.where(m < reference.CUTOFF, foot.amplitude[:, None, None] * torch.exp(-m / 2), 0.0)
+    expected = (mask * huber(values.sum(dim=0) - target)).mean()
+    gradients, v_center = [torch.empty_like(t) for t in splats], torch.full((len(center), 2), torch.nan, dtype=dtype)
+    make = _native.Renderer64 if dtype == torch.float64 else _native.Renderer32
+    images = [target.to(dtype), mask.to(dtype)]
+    loss = make(ROWS, COLS, 2).loss_vjp(
+        view, beam == "cone", *splats, *images, HUBER, 0.0, RANGE, *gradients, v_center=v_center
+    )
+    assert loss == pytest.approx(expected.item(), rel=1e-12 if dtype == torch.float64 else 1e-5)
+    error = gradient_error(v_center, torch.autograd.grad(expected, center)[0])
+    assert error < (1e-11 if dtype == torch.float64 else 1e-3)
 
 
 def test_dead_pixels_do_not_matter(isa: str) -> None:
