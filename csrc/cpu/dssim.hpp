@@ -56,7 +56,7 @@ double CpuRenderer<T>::dssim_loss(const T* target, const T* mask, double weight,
 #pragma omp parallel num_threads(threads_)
   {
     Buffer<T> scratch;
-    T* columns = scratch.reserve(5 * pitch);
+    T *columns = scratch.reserve(5 * pitch + width), *slope = columns + 5 * pitch;  // of a row
     memset(columns, 0, 5 * pitch * sizeof(T));
 #pragma omp for schedule(static)
     for (int y = 0; y < rows_; ++y) {
@@ -88,14 +88,11 @@ double CpuRenderer<T>::dssim_loss(const T* target, const T* mask, double weight,
       };
       auto across = [&](long x, const P* m) {
         const long at = y * stride_ + x;
-        P v = m[0] + two * P::load(have + at) * m[1] + P::load(want + at) * m[2];
-        if (mask) {
-          const int n = cols_ - x < P::size ? static_cast<int>(cols_ - x) : P::size;
-          for (int i = 0; i < n; ++i) v.v[i] *= mask[static_cast<size_t>(y) * cols_ + x + i];
-        }
-        (P::load(out + x) + select(L::index() + P(T(x)) < end, v, zero)).store(out + x);
+        (m[0] + two * P::load(have + at) * m[1] + P::load(want + at) * m[2]).store(slope + x);
       };
       convolve_row<3>(window, y, rows_, stride_, width, columns, down, across);
+      const T* on = mask ? mask + static_cast<size_t>(y) * cols_ : nullptr;
+      for (int x = 0; x < cols_; ++x) out[x] += on ? on[x] * slope[x] : slope[x];
     }
   }
   double total = 0;

@@ -65,8 +65,8 @@ inline void each_ray(const FrameIn& f, const GridIn& g, int rows, int cols, int 
   }
 }
 
-// Four voxels around a ray in one slice, and their weights. Voxels outside a box are replaced by their nearest neighbour
-// inside and get no weight, so that loops over slices have no branches.
+// Four voxels around a ray in one slice, and their weights. Voxels outside a box are replaced by their nearest
+// neighbour inside and get no weight, so that loops over slices have no branches.
 struct Bilinear {
   long index[4];
   double weight[4];

@@ -14,8 +14,8 @@ inline namespace SPLAT_NS {
 template <class L>
 SPLAT_HD long tile_at(long stride, int x, int y) { return y * stride + static_cast<long>(x) * L::height; }
 
-// Rows y .. y + height - 1 of a plain image [rows, cols], rows `pitch` apart, into their place in a woven one. Rows past
-// the end are zero.
+// Rows y .. y + height - 1 of a plain image [rows, cols], rows `pitch` apart, into their place in a woven one. Rows
+// past the end are zero.
 template <class L, class T>
 inline void weave(const T* plain, long pitch, int rows, int cols, int y, T* woven, long stride) {
   constexpr int h = L::height;
