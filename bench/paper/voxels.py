@@ -37,5 +37,5 @@ def resampled(volume: Floats, grid: VolumeGrid, similarity: Similarity) -> Float
     came_from = turn.T @ (points - shift[:, None]) / scale
     middle = (np.array(grid.shape[::-1]) - 1) / 2
     index = (came_from - np.array(grid.center_mm)[:, None]) / np.array(grid.voxel_mm[::-1])[:, None] + middle[:, None]
-    moved = ndimage.map_coordinates(volume, index[::-1], order=3, mode="constant").reshape(grid.shape)
+    moved = ndimage.map_coordinates(volume, index[::-1], order=3, mode="grid-constant").reshape(grid.shape)
     return (moved / scale).astype(np.float32)

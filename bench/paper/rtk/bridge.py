@@ -157,7 +157,8 @@ def write_geometry(views: Views, path: str) -> None:
     """RTK's geometry XML, as rtkfdk, rtksart and the rest read it with --geometry."""
     writer = RTK.ThreeDCircularProjectionGeometryXMLFileWriter.New()
     writer.SetFilename(path)
-    writer.SetObject(geometry(views))
+    places = geometry(views)  # the writer keeps a bare pointer
+    writer.SetObject(places)
     writer.WriteFile()
 
 

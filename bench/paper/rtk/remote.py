@@ -46,7 +46,10 @@ class RTK:
     def available(self) -> bool:
         """Whether itk-rtk is installed there; it is not loaded."""
         ask = "from importlib.metadata import version; version('itk-rtk')"
-        return subprocess.run([self.python, "-c", ask], capture_output=True).returncode == 0
+        try:
+            return subprocess.run([self.python, "-c", ask], capture_output=True).returncode == 0
+        except OSError:  # no such Python
+            return False
 
     def require(self) -> None:
         if not self.available:
