@@ -106,7 +106,10 @@ def test_a_round_object_looks_the_same_either_way_and_stays_as_given(tmp_path):
     axis = (np.arange(EDGE) + 0.5) / EDGE * 2 - 1
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     radius = np.hypot(x, y)
-    can = 0.5 * ((radius < 0.6) & (abs(z) < 0.6)) + 0.4 * ((radius < 0.3) & (abs(z - 0.2) < 0.2))
+    # Soft, or the corners of its voxels tell.
+    can = 0.5 / (1 + np.exp((radius - 0.5) / 0.06)) * (abs(z) < 0.6) + 0.4 * np.exp(
+        -((radius / 0.3) ** 4) - (z / 0.3) ** 2
+    )
     simulate(can.astype(np.float32), tmp_path, Simulation(views=40, det=64, sigma_rot=0.03, sigma_trans=0.3), 1)
     verdict = find_orientation(read_scan(tmp_path), 0, 1)
     assert verdict.found == GIVEN
