@@ -34,6 +34,7 @@ _EPOCHS = 2  # before the first sweep
 _SWEEPS = 8  # of the poses, an epoch between them
 _LOOK_AFTER, _FAR = 2, 1.3  # after three sweeps what leaves more than this times the best is given up
 _CLEAR = 0.93  # times the given geometry's residual: less than this is evidence. Round objects come within 0.99
+_FAINTEST = 1e-30  # line integral
 _PRIOR_DEG, _PRIOR_WIDTH, _CAUTION, _REACH_PX = 5.0, 0.1, 1000.0, 1.5
 
 
@@ -121,7 +122,7 @@ def find_orientation(scan: Scan, seed: int, threads: int) -> Verdict:
         return Verdict(given, {}, False, "a parallel beam cannot tell")
     here = _coarse(scan)
     scale = float(np.sqrt((here.images.astype(np.float64) ** 2).mean()))
-    if not scale > 0:
+    if not float(here.images.max()) > _FAINTEST:  # the reconstruction itself says so
         return Verdict(given, {}, False, "the images are empty")
     trials = {c: _Trial(here, c.apply(here.nominal), scan, seed, threads) for c in candidates}
     for sweep in range(_SWEEPS):

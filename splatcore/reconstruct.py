@@ -37,7 +37,7 @@ from splatcore.reconstruction import Reconstruction
 from splatcore.scan import Scan
 from splatcore.splats import Similarity, Splats
 from splatcore.start import first_splats
-from splatcore.static import Static, accumulate_static, sigmas_of_mean, split_static, step_static
+from splatcore.static import Static, accumulate_static, sigmas_of_mean, split_static, step_static, without_doubtful_yaw
 from splatcore.staticreport import as_entries
 from splatcore.uncertainty import pose_covariance
 
@@ -182,8 +182,8 @@ class _Run:
             )
         if here.factor == max(self._works) and self._options.calibrate == "full":
             self._static_sweeps = min(_STATIC_FIRST, work.steps // len(here.nominal) // 2)
-        elif here.factor <= 2 and self._options.calibrate == "full" and self._yaw_free:
-            self._static, self._yaw_free = self._static.without_doubtful_yaw()
+        elif here.factor <= 2:
+            self._settle_yaw()
         frames = self._corrected(here.nominal)
         splats, unit = first_splats(here.images, frames, here.grid, work.splats, self._rng, self._threads)
         # A level this small is done before a second thread is awake.
@@ -212,6 +212,8 @@ class _Run:
                     f"the loss became {loss} at binning {here.factor}, step {step}; a bug, please report it"
                 )
             self._advance(work, step)
+            if len(self._works) == 1 and 2 * step >= work.steps:
+                self._settle_yaw()
             moved: dict[str, float] = {}
             if self._options.calibrate != "none" and step >= first_sweep:
                 moved = self._sweep(here, descent)
@@ -253,6 +255,14 @@ class _Run:
         self._timings["gate"] = time.monotonic() - began
         yield self.progress("poses", self._decision.sentence(), level=here.factor)
 
+    def _settle_yaw(self) -> None:
+        """Once views are free and their resolution is good enough to judge: is there a yaw at all?"""
+        if self._options.calibrate == "full" and self._yaw_free and self._normals is not None:
+            sigma = sigmas_of_mean(self._normals, self._scan.frames, self._prior)[3]
+            self._static, self._yaw_free = without_doubtful_yaw(
+                self._scan.frames, self._static, self._motions, float(sigma)
+            )
+
     def _steady(self, here: Level) -> Level:
         """The level as if all views had been exposed alike."""
         return replace(here, images=self._exposure.corrected(here.images))
@@ -292,6 +302,7 @@ class _Run:
         # Four numbers need not see every view of a fine level.
         some = slice(self._sweeps % 3, None, 3) if alone and here.factor <= 2 and len(before) > 40 else slice(None)
         normals = self._accumulate(here, descent, some)
+        self._normals = normals
         self._sweeps += 1
         self._static_sweeps -= 1
         self._deviation = 1.2533 * float(normals.residual_abs.sum() / max(normals.pixels.sum(), 1.0))

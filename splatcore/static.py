@@ -26,6 +26,7 @@ from splatcore.splats import Floats, Splats
 NAMES = ("cor_px", "roll_deg", "axis_pitch_deg", "yaw_deg")
 _STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3])  # px, deg: differences of exact group elements in float64
 _YAW_TOLD_DEG = 0.25  # with free views a smaller yaw is not told from none at low resolution; measured errors: 0.1
+_YAW_TOLD_SIGMAS = 10.0
 _YAW_STEP = 0.01  # rad; difference of two float32 images: large enough to stand above their rounding
 
 
@@ -51,12 +52,6 @@ class Static:
         """As poses.json holds them: `cor_px` is the column of the axis, the others are degrees from nominal."""
         column = axis_column(self.apply(nominal))
         return dict(zip(NAMES, (column, self.roll_deg, self.axis_pitch_deg, self.yaw_deg), strict=True))
-
-    def without_doubtful_yaw(self) -> tuple[Static, bool]:
-        """For scans whose views are free as well: the yaw back at nominal where low resolution does not clearly show
-        one, and whether it does. A yaw that is wrong by a tenth of a degree puts every source a millimetre off."""
-        clear = abs(self.yaw_deg) > _YAW_TOLD_DEG
-        return (self if clear else replace(self, yaw_deg=0.0)), clear
 
     def binned(self, factor: float) -> Static:
         """The same errors of a detector whose pixels are `factor` times as large."""
@@ -232,18 +227,45 @@ def _column_mm(nominal: Frames) -> float:
     return float(np.median(np.linalg.norm(nominal.u, axis=1) * nominal.isocentre_depth()))
 
 
+def without_doubtful_yaw(
+    nominal: Frames, static: Static, motions: RigidMotions, sigma_deg: float
+) -> tuple[Static, bool]:
+    """For scans whose views are free as well: the static part without a yaw that is not clearly seen, and whether it
+    is. A yaw that is wrong by a tenth of a degree puts every source a millimetre off.
+
+    sigma_deg: one standard deviation, the volume taken as known; errors at low resolution are several times that. What
+    "no yaw" means depends on why the axis is off its column. Where the views scatter so much along u that their mean
+    may be as far off by chance, the detector did not move against the source, and `turned` is zero; else it is the
+    detector that is off its place, and its normal is the stated one."""
+    if abs(static.yaw_deg) > max(_YAW_TOLD_DEG, _YAW_TOLD_SIGMAS * sigma_deg):
+        return static, True
+    if nominal.beam == "parallel":
+        return static, False
+    along = np.einsum("vi,vi->v", nominal.axes()[:, 0], motions.translation)
+    by_chance = 3 * float(np.std(along)) / np.sqrt(len(nominal))
+    swing = static._swing(nominal)
+    rigid = abs(swing) * _lever(nominal) < by_chance
+    return replace(static, yaw_deg=-float(np.rad2deg(swing)) if rigid else 0.0), False
+
+
+def _lever(nominal: Frames) -> float:
+    """From source to isocentre along the detector's normal, mm."""
+    return float(np.median(np.einsum("vi,vi->v", nominal.axes()[:, 2], -nominal.source)))
+
+
 def split_static(nominal: Frames, static: Static, motions: RigidMotions) -> tuple[Static, RigidMotions]:
     """The same frames with all that views share in the static part: afterwards the mean over views, in each view's
     own axes, of the rotations about u and about u x v and of the shift along u is zero.
 
     The composition is exact: `new_motions.correct(new_static.apply(nominal))` are the old frames. A shift of the object
-    along u is cor and a little yaw, since the detector does not move against the source. Of a line of pixels only the shift is split off.
+    along u is cor and a little yaw, since the detector does not move against the source.
+    Of a line of pixels only the shift is split off.
     """
     axes, total = nominal.axes(), static.motions(nominal) @ motions
     mounted, rest, every = static.turned(nominal), motions, observable(nominal)
     cone = nominal.beam == "cone"
     per_px = float(np.median(np.linalg.norm(nominal.u, axis=1)))
-    lever = np.median(np.einsum("vi,vi->v", axes[:, 2], -nominal.source)) if cone else 1.0
+    lever = _lever(nominal) if cone else 1.0
     for _ in range(20):
         omega, tau = (np.einsum("vij,vj->vi", axes, part).mean(axis=0) for part in rest.vectors())
         shift = tau[0]

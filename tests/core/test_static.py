@@ -22,6 +22,7 @@ from splatcore.static import (
     split_static,
     step_static,
     tangents,
+    without_doubtful_yaw,
 )
 
 ALL_AT_ONCE = Static(2.0, 0.8, -0.6, 0.9)
@@ -256,5 +257,16 @@ def test_free_views_and_the_scanner_together_find_both():
 
 
 def test_a_doubtful_yaw_is_dropped_and_a_clear_one_kept():
-    assert Static(yaw_deg=0.1).without_doubtful_yaw() == (Static(), False)
-    assert Static(yaw_deg=-0.8).without_doubtful_yaw() == (Static(yaw_deg=-0.8), True)
+    frames, still = orbit(), RigidMotions.identity(12)
+    assert without_doubtful_yaw(frames, Static(2.0, yaw_deg=0.1), still, 0.001) == (Static(2.0), False)
+    assert without_doubtful_yaw(frames, Static(2.0, yaw_deg=0.8), still, 0.2) == (Static(2.0), False)
+    clear = Static(2.0, yaw_deg=-0.8)
+    assert without_doubtful_yaw(frames, clear, still, 0.01) == (clear, True)
+
+
+def test_where_views_scatter_their_mean_does_not_turn_the_detector():
+    """A shift of 0.1 px is well within the mean of jitter of a millimetre: the detector moved with the source."""
+    frames = orbit()
+    found, clear = without_doubtful_yaw(frames, Static(0.1, yaw_deg=0.1), jitter(12), 0.001)
+    assert not clear and found.offset_px == 0.1 and found.yaw_deg != 0
+    assert found.turned(frames) == pytest.approx(0, abs=1e-12)
