@@ -24,6 +24,8 @@ from splatcore.options import Options
 from splatcore.poses import Prior, accumulate, step_full
 from splatcore.pyramid import Level, level
 from splatcore.scan import Scan
+from splatcore.splats import Similarity
+from splatcore.static import Static, accumulate_static, step_static
 from splatcore.trial import try_frames
 
 _PIXELS = 32  # along the shorter side of the detector: enough to see an object turn
@@ -31,8 +33,10 @@ _MOST_VIEWS = 96
 _FEWEST_VIEWS = 8
 _SPLATS = 1_500
 _EPOCHS = 2  # before the first sweep
-_SWEEPS = 8  # of the poses, an epoch between them
-_LOOK_AFTER, _FAR = 2, 1.3  # after three sweeps what leaves more than this times the best is given up
+_SWEEPS = 10  # of the poses, an epoch between them
+_TOGETHER = 3  # the first of them move all views together: the centre of rotation may be far off
+_FAR_OFF = 5.0  # how much farther than a view's own place
+_LOOK_AFTER, _FAR = 4, 1.3  # after five sweeps what leaves more than this times the best is given up
 _CLEAR = 0.93  # times the given geometry's residual: less than this is evidence. Round objects come within 0.99
 _FAINTEST = 1e-30  # line integral
 _PRIOR_DEG, _PRIOR_WIDTH, _CAUTION, _REACH_PX = 5.0, 0.1, 1000.0, 1.5
@@ -202,7 +206,7 @@ class _Trial:
         reach = _REACH_PX * here.pixel_at_isocentre_mm
         self._limit = np.array([reach / half] * 3 + [3 * reach] * 3)
         self._prior = Prior(float(np.deg2rad(_PRIOR_DEG)), _PRIOR_WIDTH * half)
-        self._motions = RigidMotions.identity(views)
+        self._static, self._motions, self._sweeps = Static(), RigidMotions.identity(views), 0
         self._huber = float(here.images.max())
         self._descent = try_frames(
             here, nominal, np.arange(views), seed, threads, steps=_EPOCHS * views, of=(_EPOCHS + _SWEEPS) * views,
@@ -216,18 +220,28 @@ class _Trial:
         self._descent, self.alive = None, False
 
     def sweep(self) -> None:
-        """All poses once, then every view once."""
+        """All poses once, together or each for itself, then every view once."""
         if self._descent is None:
             return
         here, descent, nominal = self._here, self._descent, self._nominal
-        frames = self._motions.correct(nominal)
-        normals = accumulate(descent.renderer, descent.splats, frames, here.images, here.mask, self._huber)
-        motions, strain, _ = step_full(normals, self._motions, self._prior, self._limit, _CAUTION)
-        similarity, self._motions = settle(nominal, motions)
+        scanner, self._sweeps = self._static.apply(nominal), self._sweeps + 1
+        if self._sweeps <= _TOGETHER:
+            normals = accumulate_static(
+                descent.renderer, descent.splats, nominal, self._static, self._motions, here.images, here.mask,
+                self._huber, yaw=False,
+            )  # fmt: skip
+            wide = replace(self._prior, translation=_FAR_OFF * self._prior.translation)
+            self._static, strain, _ = step_static(normals, nominal, self._static, self._motions, wide, _CAUTION)
+            scanner, similarity = self._static.apply(nominal), Similarity(np.eye(3), np.zeros(3))
+        else:
+            frames = self._motions.correct(scanner)
+            normals = accumulate(descent.renderer, descent.splats, frames, here.images, here.mask, self._huber)
+            motions, strain, _ = step_full(normals, self._motions, self._prior, self._limit, _CAUTION)
+            similarity, self._motions = settle(scanner, motions)
         self._huber = max(2.5 * float(normals.residual_abs.sum() / max(normals.pixels.sum(), 1.0)), 1e-30)
         means = (descent.splats.means @ (np.eye(3) + strain)).astype(np.float32)
         descent.replace(replace(descent.splats, means=means).moved(similarity))
-        frames = self._motions.correct(nominal)
+        frames = self._motions.correct(scanner)
         packed = frames.packed()
         for view in self._rng.permutation(len(nominal)):
             descent.step(packed[view], nominal.beam == "cone", here.images[view], here.mask)

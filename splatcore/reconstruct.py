@@ -297,7 +297,8 @@ class _Run:
     def _sweep(self, here: Level, descent: Descent) -> dict[str, float]:
         """One Gauss-Newton step of all poses; the splats follow strain and gauge. Returns how far poses moved."""
         before, static = self._motions, self._at(here.nominal)
-        caution = 1.0 if here.factor == min(self._works) else _CAUTION
+        coarse = here.factor > min(self._works) or self._sweeps < _STATIC_FIRST
+        caution = _CAUTION if coarse else 1.0
         alone = self._alone
         # Four numbers need not see every view of a fine level.
         some = slice(self._sweeps % 3, None, 3) if alone and here.factor <= 2 and len(before) > 40 else slice(None)

@@ -25,6 +25,7 @@ from splatcore.splats import Floats, Splats
 
 NAMES = ("cor_px", "roll_deg", "axis_pitch_deg", "yaw_deg")
 _STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3])  # px, deg: differences of exact group elements in float64
+_REACH_DEG = (3.0, 3.0, 1.0)  # longest step of roll, pitch, yaw; of cor, a sixteenth of the detector
 _YAW_TOLD_DEG = 0.25  # with free views a smaller yaw is not told from none at low resolution; measured errors: 0.1
 _YAW_TOLD_SIGMAS = 10.0
 _YAW_STEP = 0.01  # rad; difference of two float32 images: large enough to stand above their rounding
@@ -110,8 +111,10 @@ def accumulate_static(
     targets: Floats,
     mask: Floats | None,
     huber: float,
+    yaw: bool = True,
 ) -> Normals:
     """Normal equations of every view with the detector's yaw as thirteenth direction, in rad. [views, 13, 13]
+    yaw: false leaves it where it is, at less than half the cost.
 
     The derivative image Y of the yaw is a central difference of two renders. Its products with the twelve directions
     come from the core: called with the target I - Y and the present weights as mask, the gradient is sum w D Y.
@@ -120,12 +123,12 @@ def accumulate_static(
     hessian, gradient, sums = np.zeros((views, 13, 13)), np.zeros((views, 13)), np.zeros((views, 4))
     cone = nominal.beam == "cone"
     rigid = static.motions(nominal) @ motions
-    if not observable(nominal)[3]:
+    if not (yaw and observable(nominal)[3]):
         plain = accumulate(renderer, splats, rigid.correct(static.mounted(nominal)), targets, mask, huber)
         hessian[:, :12, :12], gradient[:, :12] = plain.hessian, plain.gradient
         return replace(plain, hessian=hessian, gradient=gradient)
     packed, before, after = (
-        rigid.correct(static.mounted(nominal, turn)).packed() for turn in (0.0, -_YAW_STEP, _YAW_STEP)
+        rigid.correct(static.mounted(nominal, angle)).packed() for angle in (0.0, -_YAW_STEP, _YAW_STEP)
     )
     image, left, right = (np.empty((nominal.rows, nominal.cols), np.float32) for _ in range(3))
     block, column, unused = np.zeros((12, 12)), np.zeros(12), np.zeros((12, 12))
@@ -136,18 +139,18 @@ def accumulate_static(
         renderer.render(packed[k], cone, *splats.arrays(), image)
         renderer.render(before[k], cone, *splats.arrays(), left)
         renderer.render(after[k], cone, *splats.arrays(), right)
-        yaw = (right - left) / np.float32(2 * _YAW_STEP)
+        turn = (right - left) / np.float32(2 * _YAW_STEP)
         residual = image - view
         weight = np.minimum(np.float32(huber) / np.maximum(np.abs(residual), np.float32(1e-30)), np.float32(1))
         if mask is not None:
             weight *= mask
-        scale = np.float32(1 / max(float(np.abs(yaw).max()), 1e-30))
+        scale = np.float32(1 / max(float(np.abs(turn).max()), 1e-30))
         renderer.motion_normal(
-            packed[k], cone, *splats.arrays(), image - yaw * scale, weight, float(np.float32(1e30)), unused, column
+            packed[k], cone, *splats.arrays(), image - turn * scale, weight, float(np.float32(1e30)), unused, column
         )
         hessian[k, 12, :12] = hessian[k, :12, 12] = column / scale
-        hessian[k, 12, 12] = np.sum(weight * yaw * yaw, dtype=np.float64)
-        gradient[k, 12] = np.sum(weight * yaw * residual, dtype=np.float64)
+        hessian[k, 12, 12] = np.sum(weight * turn * turn, dtype=np.float64)
+        gradient[k, 12] = np.sum(weight * turn * residual, dtype=np.float64)
     return Normals(hessian, gradient, *sums.T)
 
 
@@ -197,6 +200,7 @@ def step_static(
     covariance = np.zeros((10, 10))
     covariance[np.ix_(free, free)] = np.linalg.inv(system[np.ix_(free, free)])
     step = -covariance @ (gradient + precision * offset)
+    step[:4] /= max(1.0, float(np.abs(step[:4] / [nominal.cols / 16, *_REACH_DEG]).max()))
     xx, yy, zz, yz, xz, xy = np.clip(step[4:], -0.01, 0.01)
     sigma = np.where(free[:4], np.sqrt(np.diag(covariance)[:4]), np.inf)
     return Static.of(static.vector() + step[:4]), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), sigma
