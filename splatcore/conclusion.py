@@ -9,10 +9,11 @@ import numpy as np
 from splatcore.diagnose import diagnose
 from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.options import Options
-from splatcore.poses import Normals, axis_column, split_static
+from splatcore.poses import Normals
 from splatcore.reconstruction import Reconstruction
 from splatcore.scan import Scan
 from splatcore.splats import Splats
+from splatcore.static import Static, split_static
 
 
 def conclude(
@@ -29,7 +30,7 @@ def conclude(
 ) -> Reconstruction:
     """The result of a run, whatever its method.
 
-    options: resolved. motions: every view's own, `corrected` has the static part in it as well. normals: at the
+    options: resolved. motions: of every view against nominal. normals: at the
     final poses and full resolution. sigma: of omega [views, 3] rad and tau [views, 3] mm. timings: seconds by stage,
     to which voxelize, diagnose and total are added; began: of the run, on time.monotonic's clock.
     """
@@ -37,11 +38,11 @@ def conclude(
     start = time.monotonic()
     volume = splats.voxelize(scan.volume, options.threads)
     timings["voxelize"] = time.monotonic() - start
-    # What all views share along u is the scanner's; as a motion of the object it shows in every frame.
-    _, corrections = split_static(scan.frames, motions)
-    static = {"cor_px": axis_column(corrected)}
+    # What all views share in their own axes is the scanner's; the frames have it in them either way.
+    found, corrections = split_static(scan.frames, Static(), motions)
+    static = found.to_json(scan.frames)
     start = time.monotonic()
-    report = diagnose(scan, options, corrected, corrections, static, normals, sigma, options.threads)
+    report = diagnose(scan, options, corrected, corrections, static, {}, normals, sigma, options.threads)
     timings["diagnose"] = time.monotonic() - start
     timings["total"] = time.monotonic() - began
     return Reconstruction(

@@ -19,6 +19,7 @@ from splatcore.options import Options
 from splatcore.poses import Normals, accumulate
 from splatcore.pyramid import Level, factors, level
 from splatcore.scan import Scan
+from splatcore.staticreport import static_findings
 from splatcore.trial import try_frames
 
 _HOLD_OUT_EVERY = 8
@@ -58,7 +59,8 @@ def diagnose(
     options: Options,
     corrected: Frames,
     corrections: RigidMotions,
-    static: dict[str, float],
+    static: dict[str, Any],
+    static_sigma: dict[str, float],
     normals: Normals,
     sigma: tuple[Array, Array],
     threads: int,
@@ -80,7 +82,7 @@ def diagnose(
     findings = [
         _geometry(options, before, after, chance, rotation_rms, translation_rms),
         _held_out(options, before, after, held_out),
-        _centre(static, scan.frames),
+        *static_findings(scan, static, static_sigma, options.calibrate != "none"),
         _outliers(normals.rms),
         _sigma_note(options),
     ]
@@ -208,17 +210,6 @@ def _held_out(options: Options, before: Trial, after: Trial, held_out: Array) ->
         f"residual of {after.held_out_rms:.4g} after calibration, {before.held_out_rms:.4g} before. Their poses come "
         "from the full run.",
         "evidence": {"before": before.held_out_rms, "after": after.held_out_rms, "views": int(held_out.sum())},
-    }
-
-
-def _centre(static: dict[str, float], nominal: Frames) -> dict[str, Any]:
-    expected = float(nominal.project(np.zeros((1, 3)))[:, 0, 0].mean())
-    off = static["cor_px"] - expected
-    return {
-        "name": "centre of rotation",
-        "severity": "warning" if abs(off) > 0.25 else "ok",
-        "text": f"The rotation axis falls on column {static['cor_px']:.2f}, {off:+.2f} px from nominal.",
-        "evidence": {"cor_px": static["cor_px"], "nominal_px": expected},
     }
 
 

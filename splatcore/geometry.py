@@ -204,6 +204,13 @@ class RigidMotions:
         """Rotation vectors [views, 3] rad and translations [views, 3] mm."""
         return cls(rotation_from_vector(omega), np.array(tau, np.float64))
 
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+    def __getitem__(self, views: Any) -> RigidMotions:
+        """The chosen views (a slice, a mask or an index array)."""
+        return RigidMotions(self.rotation[views], self.translation[views])
+
     def vectors(self) -> tuple[Array, Array]:
         """(omega rad, tau mm), the inverse of `exp`."""
         return vector_from_rotation(self.rotation), self.translation

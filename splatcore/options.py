@@ -15,9 +15,10 @@ from splatcore.errors import OptionsError
 Calibrate = Literal["full", "static", "none"]
 Quality = Literal["preview", "normal", "fine"]
 Method = Literal["splatct", "r2", "paper"]
+Rotation = Literal["auto", "given", "reversed"]
 Switch = Literal["on", "off"]
 
-_CHOICES = {"calibrate": Calibrate, "gate": Switch, "quality": Quality, "method": Method}
+_CHOICES = {"calibrate": Calibrate, "gate": Switch, "rotation": Rotation, "quality": Quality, "method": Method}
 
 
 def _knob(default: Any, help: str, low: float | None = None, high: float | None = None) -> Any:
@@ -35,6 +36,12 @@ class Options:
     gate: Switch = _knob(
         "on", "on: held-out views decide whether views move as freely as `calibrate` allows; off: they do"
     )  # fmt: skip
+    rotation: Rotation = _knob(
+        "auto", "turning sense. auto: the images decide, and whether rows and columns are exchanged; given: as "
+        "the scan says; reversed: the other way"
+    )  # fmt: skip
+    flip_u: bool = _knob(False, "the images are stored mirrored left to right")
+    flip_v: bool = _knob(False, "the images are stored upside down; nothing but the volume's handedness shows it")
     quality: Quality = _knob("normal", "preview stops at half resolution; fine runs longer")
     splats: int | None = _knob(None, "Gaussians at full resolution; default: chosen from the volume", 100, 5_000_000)
     method: Method = _knob(
@@ -51,10 +58,10 @@ class Options:
         for name, kind in _CHOICES.items():
             if getattr(self, name) not in get_args(kind):
                 raise OptionsError(f"{name}: got {getattr(self, name)!r}, expected one of {', '.join(get_args(kind))}")
-        if not isinstance(self.exposure, bool):
-            raise OptionsError(f"exposure: got {self.exposure!r}, expected true or false")
         for knob in dataclasses.fields(self):
             value, low, high = getattr(self, knob.name), knob.metadata["low"], knob.metadata["high"]
+            if isinstance(knob.default, bool) and not isinstance(value, bool):
+                raise OptionsError(f"{knob.name}: got {value!r}, expected true or false")
             if low is None or value is None:
                 continue
             whole = knob.name != "dssim"
@@ -92,7 +99,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Every knob as a command-line option; left out means its default."""
     for knob in describe():
         if isinstance(knob["default"], bool):
-            parser.add_argument(f"--{knob['name']}", action=argparse.BooleanOptionalAction, help=knob["help"])
+            flag = f"--{knob['name'].replace('_', '-')}"
+            parser.add_argument(flag, action=argparse.BooleanOptionalAction, help=knob["help"])
             continue
         kind = str if knob["choices"] else (float if isinstance(knob["default"], float) else int)
         parser.add_argument(f"--{knob['name']}", type=kind, choices=knob["choices"], help=knob["help"])

@@ -15,7 +15,7 @@ from splatcore.reconstruction import Reconstruction
 from splatcore.scangeometry import read_frames
 
 FORMAT = "splatct-poses/1"
-_NOTE = "sigma null: this direction of motion does not show in the projections; it was left at its nominal value"
+_NOTE = "sigma null: this direction or parameter does not show in the projections; it was left at its nominal value"
 
 
 def poses_document(r: Reconstruction) -> dict[str, Any]:
@@ -40,12 +40,20 @@ def poses_document(r: Reconstruction) -> dict[str, Any]:
         "beam": r.corrected.beam,
         "detector": {"rows": r.corrected.rows, "cols": r.corrected.cols},
         "views": views,
-        "static": {name: float(value) if math.isfinite(value) else None for name, value in r.static.items()},
+        "static": {name: _plain(value) for name, value in r.static.items()},
+        "static_sigma": {name: _plain(value) for name, value in r.static_sigma.items()},
         "gauge": r.gauge,
     }
-    if not (np.isfinite(r.sigma_rotation_deg).all() and np.isfinite(r.sigma_translation_mm).all()):
+    sigmas = (r.sigma_rotation_deg, r.sigma_translation_mm, np.array(list(r.static_sigma.values())))
+    if not all(np.isfinite(sigma).all() for sigma in sigmas):
         document["notes"] = [_NOTE]
     return document
+
+
+def _plain(value: float | bool) -> float | bool | None:
+    if isinstance(value, bool):
+        return value
+    return float(value) if math.isfinite(value) else None
 
 
 def _finite(values: Array) -> list[float | None]:

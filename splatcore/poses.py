@@ -21,8 +21,8 @@ from splatcore.splats import Floats, Splats
 class Normals:
     """Normal equations of every view at its present pose. Units: rad, mm, unitless line integrals."""
 
-    hessian: Array  # [views, 12, 12]: omega, tau, strain
-    gradient: Array  # [views, 12]
+    hessian: Array  # [views, n, n]: omega, tau, strain; with the detector's yaw (rad) n = 13, without it 12
+    gradient: Array  # [views, n]
     weighted_ss: Array  # [views] sum w r^2
     residual_ss: Array  # [views] sum r^2
     residual_abs: Array  # [views] sum |r|
@@ -81,15 +81,17 @@ def accumulate(
 
 
 def step_full(
-    normals: Normals, motions: RigidMotions, prior: Prior, limit: Array, caution: float = 1.0
-) -> tuple[RigidMotions, Array]:
-    """New poses after one damped Gauss-Newton step, and the strain [3, 3] that the object's means must follow.
+    normals: Normals, motions: RigidMotions, prior: Prior, limit: Array, caution: float = 1.0, yaw: float = 0.0
+) -> tuple[RigidMotions, Array, float]:
+    """New poses after one damped Gauss-Newton step, the strain [3, 3] that the object's means must follow, and the
+    step of the detector's yaw, rad (zero where the normal equations do not hold it).
 
-    Views and strain are solved jointly (Schur complement of the arrow-shaped system): a stretched object seen
+    Views and what they share are solved jointly (Schur complement of the arrow-shaped system): a stretched object seen
     from slightly wrong angles and distances is nearly the same scan, and alternation alone takes hundreds of
     sweeps to find its way along that valley.
     limit [6]: no component of a view's step exceeds it (rad, mm); the whole step is shortened instead.
     caution: how many pixels count as one independent measurement against the prior.
+    yaw: the detector's present yaw, rad, which its prior pulls towards zero.
     """
     noise = caution * normals.noise
     precision = prior.precision()
@@ -102,50 +104,20 @@ def step_full(
     mixed = hessian[:, :6, 6:]
     solved = np.linalg.solve(views, np.concatenate([pull[..., None], mixed], axis=2))
     schur = hessian[:, 6:, 6:].sum(axis=0) - np.einsum("vij,vik->jk", mixed, solved[..., 1:])
-    schur += 1e-3 * np.diag(np.diag(schur)) + np.eye(6) / prior.strain**2
+    width = np.array([prior.strain] * 6 + [prior.rotation] * (schur.shape[0] - 6))
+    schur += 1e-3 * np.diag(np.diag(schur)) + np.diag(1 / width**2)
     right = gradient[:, 6:].sum(axis=0) - np.einsum("vij,vi->j", mixed, solved[..., 0])
-    strain = np.clip(-np.linalg.solve(schur, right), -0.01, 0.01)
-    step = -solved[..., 0] - solved[..., 1:] @ strain
+    right[6:] += yaw / prior.rotation**2
+    shared = -np.linalg.solve(schur, right)
+    shared[:6] = np.clip(shared[:6], -0.01, 0.01)
+    step = -solved[..., 0] - solved[..., 1:] @ shared
     step /= np.maximum(1.0, np.abs(step / limit).max(axis=1))[:, None]
-    xx, yy, zz, yz, xz, xy = strain
+    xx, yy, zz, yz, xz, xy = shared[:6]
     return (
         motions @ RigidMotions.exp(step[:, :3], step[:, 3:]),
         np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
+        float(shared[6]) if len(shared) > 6 else 0.0,
     )
-
-
-def step_static(normals: Normals, frames: Frames, offset_mm: float, prior: Prior) -> float:
-    """The centre of rotation after one Gauss-Newton step: how far the axis lies from nominal along u, in mm at the
-    isocentre. All views share it; its derivative is that of the object shifted along u."""
-    along = _along_u(frames)
-    noise = normals.noise
-    curvature = np.einsum("vi,vij,vj->v", along, normals.hessian[:, 3:6, 3:6], along) / noise
-    slope = np.einsum("vi,vi->v", along, normals.gradient[:, 3:6]) / noise
-    precision = 1 / prior.translation**2
-    return offset_mm - float((slope.sum() + precision * offset_mm) / (curvature.sum() + precision))
-
-
-def off_centre(frames: Frames, offset_mm: float) -> Frames:
-    """A scanner whose axis lies `offset_mm` from nominal along u: the detector moved the other way, by as much as
-    that is at the detector. Median magnification over views."""
-    width = np.linalg.norm(frames.u, axis=1) * frames.isocentre_depth()
-    return frames.shifted_detector(-offset_mm / float(np.median(width)))
-
-
-def split_static(frames: Frames, motions: RigidMotions) -> tuple[float, RigidMotions]:
-    """(the mean shift along u in mm, the motions without it): static and per-view parts share no direction."""
-    along = _along_u(frames)
-    offset = float(np.einsum("vi,vi->v", along, motions.translation).mean())
-    return offset, RigidMotions(motions.rotation, motions.translation - offset * along)
-
-
-def _along_u(frames: Frames) -> Array:
-    return frames.u / np.linalg.norm(frames.u, axis=1, keepdims=True)
-
-
-def axis_column(corrected: Frames) -> float:
-    """`cor_px`: the detector column on which the rotation axis falls at the isocentre's height, mean over views."""
-    return float(corrected.project(np.zeros((1, 3)))[:, 0, 0].mean())
 
 
 def sigmas(normals: Normals, prior: Prior) -> tuple[Array, Array]:

@@ -27,23 +27,18 @@ from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.jitter import narrowed
 from splatcore.machine import threads_allowed
 from splatcore.options import Options
+from splatcore.orientation import Verdict, oriented
+from splatcore.orientation import finding as orientation_finding
 from splatcore.planar import common_plane, unseen
-from splatcore.poses import (
-    Normals,
-    Prior,
-    accumulate,
-    axis_column,
-    off_centre,
-    split_static,
-    step_full,
-    step_static,
-)
+from splatcore.poses import Normals, Prior, accumulate, step_full
 from splatcore.progress import Progress
 from splatcore.pyramid import Level, factors, level
 from splatcore.reconstruction import Reconstruction
 from splatcore.scan import Scan
-from splatcore.splats import Splats
+from splatcore.splats import Similarity, Splats
 from splatcore.start import first_splats
+from splatcore.static import Static, accumulate_static, sigmas_of_mean, split_static, step_static, without_doubtful_yaw
+from splatcore.staticreport import as_entries
 from splatcore.uncertainty import pose_covariance
 
 # Adam steps at each binning factor. Coarse steps cost a hundredth of fine ones.
@@ -54,6 +49,7 @@ _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at mo
 # Above full resolution what residuals hold is mostly the model's own error, alike in thousands of pixels. Taken
 # for independent noise it drives a view of a nearly round object round its axis into a wrong minimum.
 _CAUTION = 1000.0
+_STATIC_FIRST = 3  # sweeps of the coarsest level that move no single view
 _REACH_PX = 1.5  # longest pose step, in pixels of the level
 _WORTH_THREADS = 4_000  # splats
 _FAINTEST = 1e-30  # line integral; single precision has no room for the squares of less
@@ -87,7 +83,9 @@ def reconstruct(scan: Scan, options: Options | None = None) -> Generator[Progres
     if options is not None and options.method != "splatct":
         return (yield from r2.reconstruct(scan, options))
     options = resolved(scan, options or Options())
-    run = _Run(scan, options)
+    assert options.threads is not None
+    scan, orientation = oriented(scan, options, options.threads)
+    run = _Run(scan, options, orientation)
     yield run.progress("start", f"{len(scan.frames)} views of {scan.frames.rows} x {scan.frames.cols}")
     scales = factors(scan, _FINEST[options.quality])
     run.plan(scales)
@@ -130,8 +128,8 @@ class _Work:
 class _Run:
     """One reconstruction under way: the splats, the poses and the clock."""
 
-    def __init__(self, scan: Scan, options: Options) -> None:
-        self._scan, self._options = scan, options
+    def __init__(self, scan: Scan, options: Options, orientation: Verdict) -> None:
+        self._scan, self._options, self._orientation = scan, options, orientation
         assert options.threads is not None and options.splats is not None
         self._threads, self._most_splats = options.threads, options.splats
         self._rng = np.random.default_rng(options.seed)
@@ -146,7 +144,10 @@ class _Run:
             translation = max(stated.translation_mm, _TIGHTEST)
         self._prior = Prior(float(np.deg2rad(rotation_deg)), translation)
         self._radius = half
-        self._offset = 0.0  # of the rotation axis along u, mm at the isocentre
+        self._static = Static()
+        self._sweeps = 0
+        self._static_sweeps = 0  # how many more sweeps solve the static part alone, before the views are free
+        self._yaw_free = options.calibrate != "none"
         self._motions = RigidMotions.identity(len(scan.frames))
         self._decision: Decision | None = None
         self._splats: Splats | None = None
@@ -179,6 +180,10 @@ class _Run:
                 f"the projections are empty: their largest line integral is {top:.3g} at binning {here.factor}, "
                 "expected an object that absorbs; check the sign, kind and scale of the projections"
             )
+        if here.factor == max(self._works) and self._options.calibrate == "full":
+            self._static_sweeps = min(_STATIC_FIRST, work.steps // len(here.nominal) // 2)
+        elif here.factor <= 2:
+            self._settle_yaw()
         frames = self._corrected(here.nominal)
         splats, unit = first_splats(here.images, frames, here.grid, work.splats, self._rng, self._threads)
         # A level this small is done before a second thread is awake.
@@ -207,9 +212,10 @@ class _Run:
                     f"the loss became {loss} at binning {here.factor}, step {step}; a bug, please report it"
                 )
             self._advance(work, step)
+            if len(self._works) == 1 and 2 * step >= work.steps:
+                self._settle_yaw()
             moved: dict[str, float] = {}
-            fixed = self._options.calibrate == "none" or (self._decision and self._decision.model == "none")
-            if not fixed and step >= first_sweep:
+            if self._options.calibrate != "none" and step >= first_sweep:
                 moved = self._sweep(here, descent)
                 packed = self._corrected(here.nominal).packed()
             if drifting and step >= first_sweep:
@@ -233,8 +239,9 @@ class _Run:
         assert self._normals is not None
         began, time_s = time.monotonic(), self._scan.time_s
         moment = None if time_s is None else np.array(time_s)
+        scanner = self._at(here.nominal).apply(here.nominal)
         self._decision = gate(
-            self._steady(here),
+            replace(self._steady(here), nominal=scanner),
             self._motions,
             self._normals,
             self._prior,
@@ -244,22 +251,44 @@ class _Run:
         )
         if self._decision.model == "full":
             self._prior = narrowed(self._prior, self._motions, information(self._normals))
-        _, self._motions = settle(here.nominal, self._decision.motions)
+        _, self._motions = settle(scanner, self._decision.motions)
         self._timings["gate"] = time.monotonic() - began
         yield self.progress("poses", self._decision.sentence(), level=here.factor)
+
+    def _settle_yaw(self) -> None:
+        """Once views are free and their resolution is good enough to judge: is there a yaw at all?"""
+        if self._options.calibrate == "full" and self._yaw_free and self._normals is not None:
+            sigma = sigmas_of_mean(self._normals, self._scan.frames, self._prior)[3]
+            self._static, self._yaw_free = without_doubtful_yaw(
+                self._scan.frames, self._static, self._motions, float(sigma)
+            )
 
     def _steady(self, here: Level) -> Level:
         """The level as if all views had been exposed alike."""
         return replace(here, images=self._exposure.corrected(here.images))
 
+    def _at(self, nominal: Frames) -> Static:
+        """The static part in the pixels of a level."""
+        return self._static.binned(self._scan.frames.cols // nominal.cols)
+
+    @property
+    def _alone(self) -> bool:
+        """Whether the static part is solved and no view moves for itself."""
+        still = self._decision is not None and self._decision.model == "none"
+        return self._options.calibrate == "static" or self._static_sweeps > 0 or still
+
     def _corrected(self, nominal: Frames) -> Frames:
         """Static part first, then every view's own."""
-        return self._motions.correct(off_centre(nominal, self._offset))
+        return self._motions.correct(self._at(nominal).apply(nominal))
 
-    def _accumulate(self, here: Level, descent: Descent) -> Normals:
-        frames = self._corrected(here.nominal)
+    def _accumulate(self, here: Level, descent: Descent, some: slice = slice(None)) -> Normals:
+        """Normal equations of all or some views, with the detector's yaw as long as it is solved."""
         huber = _HUBER * self._deviation or float(np.abs(here.images).max())
-        return accumulate(descent.renderer, descent.splats, frames, here.images, here.mask, huber)
+        nominal, motions, images = here.nominal[some], self._motions[some], here.images[some]
+        renderer, splats, static = descent.renderer, descent.splats, self._at(here.nominal)
+        if self._alone or self._yaw_free:
+            return accumulate_static(renderer, splats, nominal, static, motions, images, here.mask, huber)
+        return accumulate(renderer, splats, motions.correct(static.apply(nominal)), images, here.mask, huber)
 
     def _advance(self, work: _Work, step: int) -> None:
         total = sum(w.cost for w in self._works.values())
@@ -267,25 +296,39 @@ class _Run:
 
     def _sweep(self, here: Level, descent: Descent) -> dict[str, float]:
         """One Gauss-Newton step of all poses; the splats follow strain and gauge. Returns how far poses moved."""
-        before, offset = self._motions, self._offset
-        normals = self._accumulate(here, descent)
+        before, static = self._motions, self._at(here.nominal)
+        coarse = here.factor > min(self._works) or self._sweeps < _STATIC_FIRST
+        caution = _CAUTION if coarse else 1.0
+        alone = self._alone
+        # Four numbers need not see every view of a fine level.
+        some = slice(self._sweeps % 3, None, 3) if alone and here.factor <= 2 and len(before) > 40 else slice(None)
+        normals = self._accumulate(here, descent, some)
+        self._normals = normals
+        self._sweeps += 1
+        self._static_sweeps -= 1
         self._deviation = 1.2533 * float(normals.residual_abs.sum() / max(normals.pixels.sum(), 1.0))
-        if self._options.calibrate == "static":
-            self._offset = step_static(normals, here.nominal, self._offset, self._prior)
+        similarity = Similarity(np.eye(3), np.zeros(3))
+        if alone:
+            static, strain, _ = step_static(normals, here.nominal[some], static, before[some], self._prior, caution)
         else:
             reach = _REACH_PX * here.pixel_at_isocentre_mm
             limit = np.array([reach / self._radius] * 3 + [3 * reach] * 3)
-            caution = 1.0 if here.factor == min(self._works) else _CAUTION
-            motions, strain = step_full(normals, before, self._prior, limit, caution)
+            turned = float(np.deg2rad(static.yaw_deg))
+            motions, strain, yaw = step_full(normals, before, self._prior, limit, caution, turned)
+            static = replace(static, yaw_deg=static.yaw_deg + float(np.rad2deg(yaw)))
+            static, motions = split_static(here.nominal, static, motions)
             if self._decision is not None:
-                motions = self._decision.restrict(here.nominal, motions, normals)
-            similarity, self._motions = settle(here.nominal, motions)
-            stretched = (descent.splats.means @ (np.eye(3) + strain)).astype(np.float32)
-            descent.replace(replace(descent.splats, means=stretched).moved(similarity))
+                motions = self._decision.restrict(static.apply(here.nominal), motions, normals)
+            similarity, self._motions = settle(static.apply(here.nominal), motions)
+        means = (descent.splats.means @ (np.eye(3) + strain)).astype(np.float32)
+        descent.replace(replace(descent.splats, means=means).moved(similarity))
+        static = static.binned(1 / here.factor)
+        column = here.pixel_at_isocentre_mm / here.factor
+        shift, self._static = column * (static.offset_px - self._static.offset_px), static
         omega, tau = (self._motions @ before.inverse()).vectors()
         return {
             "moved_deg": float(np.rad2deg(np.sqrt((omega**2).sum(axis=1).mean()))),
-            "moved_mm": float(np.hypot(np.sqrt((tau**2).sum(axis=1).mean()), self._offset - offset)),
+            "moved_mm": float(np.hypot(np.sqrt((tau**2).sum(axis=1).mean()), shift)),
         }
 
     def finish(self) -> Generator[Progress, None, Reconstruction]:
@@ -296,15 +339,17 @@ class _Run:
         corrected = self._corrected(scan.frames)
         volume = self._splats.voxelize(scan.volume, self._threads)
         self._timings["voxelize"] = time.monotonic() - began
-        # What all views share along u is the scanner's; as a motion of the object it shows in every frame.
-        _, corrections = split_static(scan.frames, self._motions)
+        corrections = self._motions
         yield self.progress("diagnose", "compare nominal and corrected geometry")
         began = time.monotonic()
         sigma_omega, sigma_tau = self._sigmas(corrected)
-        static = {"cor_px": axis_column(corrected)}
+        static = self._static.to_json(scan.frames) | self._orientation.entries()
+        static_sigma = self._static_sigmas()
         report = diagnose(
-            scan, options, corrected, corrections, static, self._normals, (sigma_omega, sigma_tau), self._threads
-        )
+            scan, options, corrected, corrections, static, static_sigma, self._normals, (sigma_omega, sigma_tau),
+            self._threads,
+        )  # fmt: skip
+        report["findings"].insert(0, orientation_finding(self._orientation, options))
         if options.exposure:
             report["findings"].append(finding(self._exposure.offset))
         if self._decision is not None:
@@ -325,11 +370,22 @@ class _Run:
             sigma_translation_mm=sigma_tau,
             residual_rms=self._normals.rms,
             static=static,
+            static_sigma=static_sigma,
             gauge=_GAUGE if options.calibrate == "full" else "nominal world kept",
             report=report,
             options=options,
             timings=self._timings,
         )
+
+    def _static_sigmas(self) -> dict[str, float]:
+        """Standard deviations of the static part; empty where it was taken as given."""
+        assert self._normals is not None
+        nominal = self._scan.frames
+        if self._alone:
+            return as_entries(step_static(self._normals, nominal, self._static, self._motions, self._prior)[2])
+        if self._options.calibrate == "full":
+            return as_entries(sigmas_of_mean(self._normals, nominal, self._prior))
+        return {}
 
     def _sigmas(self, corrected: Frames) -> tuple[Array, Array]:
         """Standard deviations of omega [views, 3] rad and tau [views, 3] mm; zero for what was not fitted."""

@@ -28,9 +28,10 @@ class Reconstruction:
     sigma_rotation_deg: Array  # [views, 3] one standard deviation; inf: not observable
     sigma_translation_mm: Array  # [views, 3] likewise
     residual_rms: Array  # [views] in line-integral units
-    static: dict[str, float]  # the scanner's constant errors: "cor_px", "roll_deg", ...
+    static: dict[str, Any]  # the scanner's constant errors: "cor_px", "roll_deg", ...; what was turned round
     gauge: str  # how the freedoms that no projection shows were fixed
     report: dict[str, Any]  # splatct-report/1
     options: Options  # resolved: no None left
+    static_sigma: dict[str, float] = field(default_factory=dict)  # by name; inf: not observable
     timings: dict[str, float] = field(default_factory=dict)  # seconds by stage
     device: str = "cpu"

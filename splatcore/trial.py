@@ -29,23 +29,35 @@ def held_out_views(views: int) -> Indices:
     return np.asarray((np.arange(count) + 0.5) * views / count, np.int64)
 
 
-def try_frames(here: Level, frames: Frames, kept: Indices, seed: int, threads: int) -> Descent | None:
+def try_frames(
+    here: Level,
+    frames: Frames,
+    kept: Indices,
+    seed: int,
+    threads: int,
+    *,
+    steps: int = _STEPS,
+    of: int | None = None,
+    splats: int = _SPLATS,
+) -> Descent | None:
     """Splats after a short reconstruction from the kept views (indices) with these frames, and their renderer. None
-    where the frames see nothing from these views. Trials with one seed draw the views in the same order."""
+    where the frames see nothing from these views. Trials with one seed draw the views in the same order.
+
+    of: steps over which the rates fall, where the caller goes on after `steps`."""
     rng = np.random.default_rng(seed)
     try:
-        splats, unit = first_splats(here.images[kept], frames[kept], here.grid, _SPLATS, rng, threads)
+        start, unit = first_splats(here.images[kept], frames[kept], here.grid, splats, rng, threads)
     except ReconstructionError:
         return None
     top = float(here.images.max())
     descent = Descent(
-        splats, frames.rows, frames.cols, voxel_mm=here.voxel_mm, density_unit=unit,
-        steps=_STEPS, rates=Rates(), huber=1e-4 * top, dssim=0.0, data_range=top, threads=threads,
+        start, frames.rows, frames.cols, voxel_mm=here.voxel_mm, density_unit=unit,
+        steps=of or steps, rates=Rates(), huber=1e-4 * top, dssim=0.0, data_range=top, threads=threads,
         plane=common_plane(frames),
     )  # fmt: skip
     packed, cone = frames.packed(), frames.beam == "cone"
     order: list[int] = []
-    for _ in range(_STEPS):
+    for _ in range(steps):
         order = order or list(rng.permutation(kept))
         view = order.pop()
         descent.step(packed[view], cone, here.images[view], here.mask)

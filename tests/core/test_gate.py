@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,6 @@ import pytest
 
 from splatcore import _native
 from splatcore.gate import MODELS, Decision, gate
-from splatcore.gauge import pose_errors
 from splatcore.geometry import RigidMotions, circular
 from splatcore.grid import VolumeGrid
 from splatcore.options import Options
@@ -17,6 +17,7 @@ from splatcore.poses import Normals, Prior, accumulate
 from splatcore.pyramid import Level, level
 from splatcore.reconstruct import drain, reconstruct
 from splatcore.simulate import Simulation
+from splatcore.static import Static, axis_column
 from splatcore.trial import held_out_views
 
 from .phantom import scan_of
@@ -40,7 +41,12 @@ def state(folder: Path, seed: int, **motion) -> tuple[Level, RigidMotions, Norma
     frames = found.corrected.binned(2)
     huber = 2 * 1.2533 * float(np.mean(found.residual_rms))
     normals = accumulate(renderer, found.splats, frames, here.images, here.mask, huber)
-    return here, pose_errors(scan.frames, found.corrected), normals
+    # The static part as a motion too: the gate is asked whether it is constant. What is no motion stays in the frames.
+    names = ("roll_deg", "axis_pitch_deg", "yaw_deg")
+    off = axis_column(scan.frames) - found.static["cor_px"]
+    static = Static(off, *(found.static[name] for name in names))
+    scanner = replace(here, nominal=static.binned(2).mounted(here.nominal))
+    return scanner, static.motions(scan.frames) @ found.corrections, normals
 
 
 @pytest.fixture(scope="module")

@@ -78,6 +78,28 @@ def test_centre_of_rotation(tmp_path):
     assert np.abs(result.corrections.translation).max() < 1e-9  # static: no view moves alone
 
 
+def test_all_static_errors_of_a_scan_that_turns_the_other_way(tmp_path):
+    wrong = {"offset_px": (1.5, 0.0), "roll_deg": 1.0, "axis_pitch_deg": 1.0, "yaw_deg": 3.0}
+    scan = scan_of(tmp_path / "scan", Simulation(views=40, det=80, reverse=True, **wrong))
+    result = drain(reconstruct(scan, Options(calibrate="static", quality="preview", threads=1)))
+    found, sigma = result.static, result.static_sigma
+    assert found["rotation_reversed"] is True
+    assert found["cor_px"] == pytest.approx(39.5 - 1.5, abs=0.05)
+    assert found["roll_deg"] == pytest.approx(1.0, abs=0.05)
+    assert found["axis_pitch_deg"] == pytest.approx(1.0, abs=0.1)
+    assert found["yaw_deg"] == pytest.approx(
+        3.0, abs=0.9
+    )  # 0.03 px a degree on this detector, at half resolution 0.015
+    assert all(0 < sigma[name] < 0.1 for name in ("cor_px", "roll_deg", "axis_pitch_deg", "yaw_deg"))
+    texts = {finding["name"]: finding["text"] for finding in result.report["findings"]}
+    assert "the two look the same" in texts["orientation of the images"]
+    assert all(word in texts["scanner alignment"] for word in ("rolled", "leans", "turned about its columns"))
+    assert "tilt of the detector" in texts["what does not show"]
+    write_results(result, tmp_path / "out")
+    poses = json.loads((tmp_path / "out" / "poses.json").read_text())
+    assert poses["static"]["rotation_reversed"] is True and poses["static_sigma"]["roll_deg"] == sigma["roll_deg"]
+
+
 def test_same_bits_again_and_at_any_number_of_threads(tmp_path):
     scan = scan_of(tmp_path, Simulation(views=20, det=64, sigma_rot=0.02, sigma_trans=0.5), edge=32)
     runs = [drain(reconstruct(scan, Options(quality="preview", threads=threads))) for threads in (1, 2, 2)]
