@@ -34,10 +34,19 @@ from splatcore.poses import Normals, Prior, accumulate, step_full
 from splatcore.progress import Progress
 from splatcore.pyramid import Level, factors, level
 from splatcore.reconstruction import Reconstruction
+from splatcore.redundancy import lopsidedness, orbit
 from splatcore.scan import Scan
 from splatcore.splats import Similarity, Splats
 from splatcore.start import first_splats
-from splatcore.static import Static, accumulate_static, sigmas_of_mean, split_static, step_static, without_doubtful_yaw
+from splatcore.static import (
+    Static,
+    accumulate_static,
+    axis_column,
+    sigmas_of_mean,
+    split_static,
+    step_static,
+    without_doubtful_yaw,
+)
 from splatcore.staticreport import as_entries
 from splatcore.uncertainty import pose_covariance
 
@@ -49,6 +58,7 @@ _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at mo
 # Above full resolution what residuals hold is mostly the model's own error, alike in thousands of pixels. Taken
 # for independent noise it drives a view of a nearly round object round its axis into a wrong minimum.
 _CAUTION = 1000.0
+_LOPSIDED = 0.2  # share of the detector's half by which the axis may be off its middle
 _STATIC_FIRST = 3  # sweeps of the coarsest level that move no single view
 _REACH_PX = 1.5  # longest pose step, in pixels of the level
 _WORTH_THREADS = 4_000  # splats
@@ -147,7 +157,10 @@ class _Run:
         self._static = Static()
         self._sweeps = 0
         self._static_sweeps = 0  # how many more sweeps solve the static part alone, before the views are free
-        self._yaw_free = options.calibrate != "none"
+        # On part of a turn, or with the axis far from the detector's middle, constant errors are hardly told from the
+        # object's place: free views take them up instead.
+        self._separable = orbit(scan.frames).full and lopsidedness(scan.frames) < _LOPSIDED
+        self._yaw_free = options.calibrate == "static" or (options.calibrate == "full" and self._separable)
         self._motions = RigidMotions.identity(len(scan.frames))
         self._decision: Decision | None = None
         self._splats: Splats | None = None
@@ -180,7 +193,7 @@ class _Run:
                 f"the projections are empty: their largest line integral is {top:.3g} at binning {here.factor}, "
                 "expected an object that absorbs; check the sign, kind and scale of the projections"
             )
-        if here.factor == max(self._works) and self._options.calibrate == "full":
+        if here.factor == max(self._works) and self._options.calibrate == "full" and self._separable:
             self._static_sweeps = min(_STATIC_FIRST, work.steps // len(here.nominal) // 2)
         elif here.factor <= 2:
             self._settle_yaw()
@@ -215,7 +228,7 @@ class _Run:
             if len(self._works) == 1 and 2 * step >= work.steps:
                 self._settle_yaw()
             moved: dict[str, float] = {}
-            if self._options.calibrate != "none" and step >= first_sweep:
+            if not self._fixed and step >= first_sweep:
                 moved = self._sweep(here, descent)
                 packed = self._corrected(here.nominal).packed()
             if drifting and step >= first_sweep:
@@ -272,10 +285,19 @@ class _Run:
         return self._static.binned(self._scan.frames.cols // nominal.cols)
 
     @property
+    def _still(self) -> bool:
+        """Whether the gate found that no view moves."""
+        return self._decision is not None and self._decision.model == "none"
+
+    @property
+    def _fixed(self) -> bool:
+        """Whether the geometry is left as it is."""
+        return self._options.calibrate == "none" or (self._still and not self._separable)
+
+    @property
     def _alone(self) -> bool:
         """Whether the static part is solved and no view moves for itself."""
-        still = self._decision is not None and self._decision.model == "none"
-        return self._options.calibrate == "static" or self._static_sweeps > 0 or still
+        return self._options.calibrate == "static" or self._static_sweeps > 0 or self._still
 
     def _corrected(self, nominal: Frames) -> Frames:
         """Static part first, then every view's own."""
@@ -316,14 +338,16 @@ class _Run:
             turned = float(np.deg2rad(static.yaw_deg))
             motions, strain, yaw = step_full(normals, before, self._prior, limit, caution, turned)
             static = replace(static, yaw_deg=static.yaw_deg + float(np.rad2deg(yaw)))
-            static, motions = split_static(here.nominal, static, motions)
+            if self._separable:
+                static, motions = split_static(here.nominal, static, motions)
             if self._decision is not None:
                 motions = self._decision.restrict(static.apply(here.nominal), motions, normals)
             similarity, self._motions = settle(static.apply(here.nominal), motions)
         means = (descent.splats.means @ (np.eye(3) + strain)).astype(np.float32)
         descent.replace(replace(descent.splats, means=means).moved(similarity))
-        static = static.binned(1 / here.factor)
-        column = here.pixel_at_isocentre_mm / here.factor
+        binning = self._scan.frames.cols // here.nominal.cols
+        static = static.binned(1 / binning)
+        column = here.pixel_at_isocentre_mm / binning
         shift, self._static = column * (static.offset_px - self._static.offset_px), static
         omega, tau = (self._motions @ before.inverse()).vectors()
         return {
@@ -343,8 +367,7 @@ class _Run:
         yield self.progress("diagnose", "compare nominal and corrected geometry")
         began = time.monotonic()
         sigma_omega, sigma_tau = self._sigmas(corrected)
-        static = self._static.to_json(scan.frames) | self._orientation.entries()
-        static_sigma = self._static_sigmas()
+        static, static_sigma = self._static_entries(corrected)
         report = diagnose(
             scan, options, corrected, corrections, static, static_sigma, self._normals, (sigma_omega, sigma_tau),
             self._threads,
@@ -377,15 +400,18 @@ class _Run:
             timings=self._timings,
         )
 
-    def _static_sigmas(self) -> dict[str, float]:
-        """Standard deviations of the static part; empty where it was taken as given."""
+    def _static_entries(self, corrected: Frames) -> tuple[dict[str, float], dict[str, float]]:
+        """The scanner's constant errors, and the standard deviations of those that were solved."""
         assert self._normals is not None
-        nominal = self._scan.frames
+        nominal, orientation = self._scan.frames, self._orientation.entries()
+        if self._options.calibrate == "full" and not self._separable:
+            return {"cor_px": axis_column(corrected)} | orientation, {}
+        found = self._static.to_json(nominal) | orientation
         if self._alone:
-            return as_entries(step_static(self._normals, nominal, self._static, self._motions, self._prior)[2])
+            return found, as_entries(step_static(self._normals, nominal, self._static, self._motions, self._prior)[2])
         if self._options.calibrate == "full":
-            return as_entries(sigmas_of_mean(self._normals, nominal, self._prior))
-        return {}
+            return found, as_entries(sigmas_of_mean(self._normals, nominal, self._prior))
+        return found, {}
 
     def _sigmas(self, corrected: Frames) -> tuple[Array, Array]:
         """Standard deviations of omega [views, 3] rad and tau [views, 3] mm; zero for what was not fitted."""

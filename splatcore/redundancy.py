@@ -32,9 +32,14 @@ class Orbit:
     start: float  # rad, where the arc begins, half a step before the first view
     arc: float  # rad, 2 pi for a full turn
 
+    @property
+    def full(self) -> bool:
+        """Whether it is a full turn."""
+        return self.arc == 2 * np.pi
+
     def confidence(self, angle: Array) -> Array:
         """1 inside the arc, 0 outside, a smooth way between over what the scan sees twice. Any shape, rad."""
-        if self.arc == 2 * np.pi:
+        if self.full:
             return np.ones_like(angle)
         taper = max(self.arc - np.pi, _STEPS_OF_TAPER * float(np.median(self.step)))
         taper = min(taper, self.arc / 2)
