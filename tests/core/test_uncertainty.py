@@ -191,6 +191,6 @@ def test_stated_uncertainties_cover_the_errors(tmp_path: Path) -> None:
     )
     size = np.abs(np.delete(quotient, 2, axis=1))
     # 0.68 and 0.95 would be right, 0.6 to 0.76 and 0.9 are wanted; this draw reaches 0.596 and 0.912, and others of
-    # this object less (docs/method/uncertainty.md)..
+    # this object less (docs/method/uncertainty.md).
     assert 0.55 < (size < 1).mean() < 0.76
     assert (size < 2).mean() > 0.9
