@@ -1,4 +1,4 @@
-"""From splats and poses to a Reconstruction: voxels, the scanner's static part, the diagnosis."""
+"""From splats and poses to a Reconstruction: voxels and the diagnosis."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from splatcore.poses import Normals
 from splatcore.reconstruction import Reconstruction
 from splatcore.scan import Scan
 from splatcore.splats import Splats
-from splatcore.static import Static, split_static
 
 
 def conclude(
@@ -21,7 +20,8 @@ def conclude(
     options: Options,
     splats: Splats,
     corrected: Frames,
-    motions: RigidMotions,
+    corrections: RigidMotions,
+    static: tuple[dict[str, float], dict[str, float]],
     normals: Normals,
     sigma: tuple[Array, Array],
     gauge: str,
@@ -30,19 +30,17 @@ def conclude(
 ) -> Reconstruction:
     """The result of a run, whatever its method.
 
-    options: resolved. motions: of every view against nominal. normals: at the
-    final poses and full resolution. sigma: of omega [views, 3] rad and tau [views, 3] mm. timings: seconds by stage,
-    to which voxelize, diagnose and total are added; began: of the run, on time.monotonic's clock.
+    options: resolved. corrections: every view's own part, after the static one; static: its entries and their standard
+    deviations. normals: at the final poses and full resolution. sigma: of omega [views, 3] rad and tau [views, 3] mm.
+    timings: seconds by stage, to which voxelize, diagnose and total are added; began: of the run, on time.monotonic's
+    clock.
     """
     assert options.threads is not None
     start = time.monotonic()
     volume = splats.voxelize(scan.volume, options.threads)
     timings["voxelize"] = time.monotonic() - start
-    # What all views share in their own axes is the scanner's; the frames have it in them either way.
-    found, corrections = split_static(scan.frames, Static(), motions)
-    static = found.to_json(scan.frames)
     start = time.monotonic()
-    report = diagnose(scan, options, corrected, corrections, static, {}, normals, sigma, options.threads)
+    report = diagnose(scan, options, corrected, corrections, *static, normals, sigma, options.threads)
     timings["diagnose"] = time.monotonic() - start
     timings["total"] = time.monotonic() - began
     return Reconstruction(
@@ -56,7 +54,8 @@ def conclude(
         sigma_rotation_deg=np.rad2deg(sigma[0]),
         sigma_translation_mm=sigma[1],
         residual_rms=normals.rms,
-        static=static,
+        static=static[0],
+        static_sigma=static[1],
         gauge=gauge,
         report=report,
         options=options,

@@ -59,12 +59,6 @@ def spline_basis(time: Array, segments: int) -> Array:
     return np.asarray(BSpline.design_matrix(inside, knots, _DEGREE).toarray(), np.float64)
 
 
-def camera_vectors(nominal: Frames, motions: RigidMotions) -> Array:
-    """(omega rad, tau mm) of every view in the axes of its nominal camera: u, v made square, u x v. [views, 6]"""
-    axes = nominal.axes()
-    return np.concatenate([np.einsum("vij,vj->vi", axes, part) for part in motions.vectors()], axis=1)
-
-
 def constant_motion(nominal: Frames, motions: RigidMotions, information: Array) -> Curve:
     """The one motion in camera axes that is nearest the views' own, each weighted by its information [views, 6, 6]
     (world axes, omega then tau). It holds what a rigid motion can say of static errors."""

@@ -33,6 +33,7 @@ from splatcore.reconstruction import Reconstruction
 from splatcore.scan import Scan
 from splatcore.scene import Scene, scene_of
 from splatcore.splats import Splats
+from splatcore.static import Static, split_static
 from splatcore.variation import Variation
 
 STEPS, SPLATS = 30_000, 50_000
@@ -189,7 +190,12 @@ class _Run:
             # Neither method states any; these are what the images say, with a prior as wide as the volume.
             sigma = sigmas(normals, Prior(1.0, scene.length_mm))
         gauge = "nominal world kept" if self._poses is None else "not settled: poses and splats move freely"
-        result = conclude(scan, self._options, splats, corrected, motions, normals, sigma, gauge, timings, self._began)
+        # What all views share in their own axes is the scanner's; the frames have it in them either way.
+        static, corrections = split_static(scan.frames, Static(), motions)
+        result = conclude(
+            scan, self._options, splats, corrected, corrections, (static.to_json(scan.frames), {}), normals, sigma,
+            gauge, timings, self._began,
+        )  # fmt: skip
         self._fraction = 1.0
         return result
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from splatcore import r2
+from splatcore.conclusion import conclude
 from splatcore.descent import Descent, Rates
-from splatcore.diagnose import diagnose
 from splatcore.errors import OptionsError, ReconstructionError
 from splatcore.exposure import Exposure, finding
 from splatcore.gate import Decision, gate, information
@@ -358,47 +358,23 @@ class _Run:
     def finish(self) -> Generator[Progress, None, Reconstruction]:
         """Voxels, uncertainties and the report."""
         assert self._splats is not None and self._normals is not None
-        scan, options, began = self._scan, self._options, time.monotonic()
-        scan = replace(scan, projections=self._exposure.corrected(scan.projections))
+        scan, options = self._scan, self._options
         corrected = self._corrected(scan.frames)
-        volume = self._splats.voxelize(scan.volume, self._threads)
-        self._timings["voxelize"] = time.monotonic() - began
-        corrections = self._motions
         yield self.progress("diagnose", "compare nominal and corrected geometry")
-        began = time.monotonic()
-        sigma_omega, sigma_tau = self._sigmas(corrected)
-        static, static_sigma = self._static_entries(corrected)
-        report = diagnose(
-            scan, options, corrected, corrections, static, static_sigma, self._normals, (sigma_omega, sigma_tau),
-            self._threads,
+        result = conclude(
+            replace(scan, projections=self._exposure.corrected(scan.projections)), options, self._splats, corrected,
+            self._motions, self._static_entries(corrected), self._normals, self._sigmas(corrected),
+            _GAUGE if options.calibrate == "full" else "nominal world kept", self._timings, self._began,
         )  # fmt: skip
-        report["findings"].insert(0, orientation_finding(self._orientation, options))
+        findings = result.report["findings"]
+        findings.insert(0, orientation_finding(self._orientation, options))
         if options.exposure:
-            report["findings"].append(finding(self._exposure.offset))
+            findings.append(finding(self._exposure.offset))
         if self._decision is not None:
-            report["findings"].append(self._decision.finding())
-        self._timings["diagnose"] = time.monotonic() - began
-        self._timings["total"] = time.monotonic() - self._began
+            findings.append(self._decision.finding())
         self._fraction = 1.0
-        yield self.progress("done", report["verdict"])
-        return Reconstruction(
-            scan_name=scan.name,
-            splats=self._splats,
-            volume=volume,
-            grid=scan.volume,
-            nominal=scan.frames,
-            corrected=corrected,
-            corrections=corrections,
-            sigma_rotation_deg=np.rad2deg(sigma_omega),
-            sigma_translation_mm=sigma_tau,
-            residual_rms=self._normals.rms,
-            static=static,
-            static_sigma=static_sigma,
-            gauge=_GAUGE if options.calibrate == "full" else "nominal world kept",
-            report=report,
-            options=options,
-            timings=self._timings,
-        )
+        yield self.progress("done", result.report["verdict"])
+        return result
 
     def _static_entries(self, corrected: Frames) -> tuple[dict[str, float], dict[str, float]]:
         """The scanner's constant errors, and the standard deviations of those that were solved."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatcore.geometry import RigidMotions, circular
-from splatcore.motionmodel import camera_vectors, constant_motion, smooth_motion, spline_basis
+from splatcore.motionmodel import constant_motion, smooth_motion, spline_basis
 
 VIEWS = 45
 SIGMA = np.array([0.002] * 3 + [0.1] * 3)  # rad, mm
@@ -31,6 +31,12 @@ def wave() -> np.ndarray:
     """A slow motion, each component its own; ten standard deviations."""
     phase = np.arange(6) * 1.1
     return 10 * SIGMA * np.sin(2.5 * TIME[:, None] + phase)
+
+
+def camera_vectors(nominal, motions):
+    """(omega rad, tau mm) of every view in the axes of its nominal camera: u, v made square, u x v. [views, 6]"""
+    axes = nominal.axes()
+    return np.concatenate([np.einsum("vij,vj->vi", axes, part) for part in motions.vectors()], axis=1)
 
 
 def test_basis_is_a_partition_of_unity_and_nowhere_negative():
