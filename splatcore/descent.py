@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,10 @@ class Rates:
     quat: float = 0.01
     density: float = 0.02  # of the raw parameter, density = unit * softplus(raw)
     end: float = 0.1
+
+    def times(self, factor: float) -> Rates:
+        """All rates at the start by a factor; they fall by as much as before."""
+        return Rates(self.mean * factor, self.log_scale * factor, self.quat * factor, self.density * factor, self.end)
 
 
 class Descent:
@@ -49,9 +54,9 @@ class Descent:
         self.renderer = _native.Renderer32(rows, cols, threads)
         self._limits = scale_limits or (0.15 * voxel_mm, 20 * voxel_mm)
         self._unit, self._steps, self._rates, self._voxel = density_unit, max(steps, 1), rates, voxel_mm
-        self._huber, self._dssim, self._range, self._threads = huber, dssim, data_range, threads
+        self._huber, self._dssim, self._range, self.threads = huber, dssim, data_range, threads
         self._plane = plane
-        self._count = 0
+        self._count = self._age = 0  # steps since the rates began to fall, since the moments were zero
         self._first = np.zeros(11 * len(splats), np.float32)
         self._second = np.zeros(11 * len(splats), np.float32)
         self.gradient = splats.zeros_like()  # dL/dsplats of the last `differentiate`
@@ -82,6 +87,15 @@ class Descent:
         self.gradient = splats.zeros_like()
         self.replace(splats)
 
+    def branch(self, steps: int, rates: Rates, huber: float) -> Descent:
+        """Another descent from the present state, with a copy of the moments. The rates fall over `steps`."""
+        other = copy.copy(self)
+        other._steps, other._rates, other._huber, other._count = max(steps, 1), rates, huber, 0
+        other._first, other._second = self._first.copy(), self._second.copy()
+        other.gradient = self.splats.zeros_like()
+        other.replace(self.splats)
+        return other
+
     def step(self, frame: Array, cone: bool, target: Floats, mask: Floats | None) -> float:
         """One Adam step on one view. Returns the loss before it."""
         loss = self.differentiate(frame, cone, target, mask)
@@ -102,11 +116,11 @@ class Descent:
         """One Adam step along `gradient`."""
         s, g = self.splats, self.gradient
         decay = self._rates.end ** (self._count / self._steps)
-        self._count += 1
+        self._count, self._age = self._count + 1, self._age + 1
         _native.adam(
             s.means, self._log_scales, s.quats, self._raw, s.scales, s.density, self._first, self._second, *g.arrays(),
             self._rates.mean * self._voxel * decay, self._rates.log_scale * decay, self._rates.quat * decay,
-            self._rates.density * decay, *self._limits, self._unit, self._count, self._threads,
+            self._rates.density * decay, *self._limits, self._unit, self._age, self.threads,
         )  # fmt: skip
         if self._plane:
             self._plane.flatten(s.means)

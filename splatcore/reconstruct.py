@@ -35,8 +35,9 @@ from splatcore.progress import Progress
 from splatcore.pyramid import Level, factors, level
 from splatcore.reconstruction import Reconstruction
 from splatcore.redundancy import lopsidedness, orbit
+from splatcore.refine import MOVING, Weighing, begin, weigh
 from splatcore.scan import Scan
-from splatcore.splats import Similarity, Splats
+from splatcore.splats import Similarity
 from splatcore.start import first_splats
 from splatcore.static import (
     Static,
@@ -48,10 +49,12 @@ from splatcore.static import (
     without_doubtful_yaw,
 )
 from splatcore.staticreport import as_entries
+from splatcore.trial import held_out_views
 from splatcore.uncertainty import pose_covariance
 
 # Adam steps at each binning factor. Coarse steps cost a hundredth of fine ones.
-_STEPS = {8: 600, 4: 750, 2: 1200, 1: 2400}
+_STEPS = {8: 600, 4: 750, 2: 1200, 1: 2000}
+_REFINING = 3000  # of the last stage, poses at rest
 _QUALITY = {"preview": 1.0, "normal": 1.0, "fine": 1.5}
 _FINEST = {"preview": 2, "normal": 1, "fine": 1}
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
@@ -104,6 +107,8 @@ def reconstruct(scan: Scan, options: Options | None = None) -> Generator[Progres
         yield from run.level(here)
         if factor == scales[max(len(scales) - 2, 0)] and factor != scales[-1]:
             yield from run.gate(here)
+    if options.quality != "preview":
+        yield from run.refine(here)
     return (yield from run.finish())
 
 
@@ -163,11 +168,14 @@ class _Run:
         self._yaw_free = options.calibrate == "static" or (options.calibrate == "full" and self._separable)
         self._motions = RigidMotions.identity(len(scan.frames))
         self._decision: Decision | None = None
-        self._splats: Splats | None = None
+        self._descent: Descent | None = None  # of the finest level so far
+        self._weighing: Weighing | None = None
         self._normals: Normals | None = None
         self._exposure = Exposure(len(scan.frames))
         self._deviation = 0.0  # robust residual, line-integral units, from the last sweep
         self._works: dict[int, _Work] = {}
+        self._refining = _Work(0, 0)
+        self._held = np.zeros(0, np.int64)  # views that splats of the finest level do not see before the last stage
         self._done = 0.0
         self._fraction = 0.0
 
@@ -177,6 +185,9 @@ class _Run:
             steps = int(_STEPS[factor] * _QUALITY[self._options.quality])
             splats = max(min(1_500, self._most_splats), int(self._most_splats / factor**1.5))
             self._works[factor] = _Work(steps, splats)
+        if self._options.quality != "preview":
+            self._refining = _Work(int(_REFINING * _QUALITY[self._options.quality]), self._works[scales[-1]].splats)
+            self._held = held_out_views(len(self._scan.frames))
 
     def progress(self, stage: str, message: str, **facts: object) -> Progress:
         return Progress(stage, self._fraction, message, time.monotonic() - self._began, **facts)  # type: ignore[arg-type]
@@ -198,24 +209,26 @@ class _Run:
         elif here.factor <= 2:
             self._settle_yaw()
         frames = self._corrected(here.nominal)
+        last = here.factor == min(self._works) and self._refining.steps > 0
         splats, unit = first_splats(here.images, frames, here.grid, work.splats, self._rng, self._threads)
         # A level this small is done before a second thread is awake.
         threads = self._threads if len(splats) >= _WORTH_THREADS else 1
         descent = Descent(
             splats, here.nominal.rows, here.nominal.cols, voxel_mm=here.voxel_mm,
-            density_unit=unit, steps=work.steps, rates=Rates(), huber=1e-4 * top,
+            density_unit=unit, steps=work.steps, rates=MOVING if last else Rates(), huber=1e-4 * top,
             dssim=self._options.dssim, data_range=top, threads=threads,
             plane=common_plane(frames),
         )  # fmt: skip
         yield self.progress(
             "level", f"binning {here.factor}: {len(splats)} splats", level=here.factor, splats=len(splats)
         )
-        views, cone, loss = len(frames), frames.beam == "cone", 0.0
+        drawn = np.setdiff1d(np.arange(len(frames)), [])
+        views, cone, loss = len(drawn), frames.beam == "cone", 0.0
         first_sweep = min(2 * views, int(_SETTLE_IN * work.steps))
         packed = frames.packed()
         order: list[int] = []
         for step in range(1, work.steps + 1):
-            order = order or list(self._rng.permutation(views))
+            order = order or list(self._rng.permutation(drawn))
             view = order.pop()
             loss += descent.step(packed[view], cone, here.images[view], here.mask)
             if order and step < work.steps:
@@ -241,9 +254,28 @@ class _Run:
             )  # fmt: skip
             loss = 0.0
         self._done += work.cost
-        self._splats = descent.splats
-        self._normals = self._accumulate(here, descent)
+        self._descent = descent
+        if not last:
+            self._normals = self._accumulate(here, descent)
         self._timings[f"binning_{here.factor}"] = time.monotonic() - began
+
+    def refine(self, here: Level) -> Generator[Progress, None, None]:
+        """The last stage: the poses rest, the volume gets its detail (splatcore.refine)."""
+        assert self._descent is not None
+        began, work, here = time.monotonic(), self._refining, self._steady(here)
+        frames = self._corrected(here.nominal)
+        weighed = weigh(self._descent, here, frames, self._held, self._options.seed)
+        run, steps = begin(self._descent, weighed, here, frames, work.steps, self._rng)
+        self._descent, self._weighing = run.descent, weighed[0]
+        while run.step < steps:
+            loss = run.epoch(frames, steps - run.step)
+            self._advance(work, run.step)
+            yield self.progress(
+                "refine", f"step {run.step} of {steps}", level=here.factor, step=run.step, loss=loss,
+                splats=len(run.descent.splats),
+            )  # fmt: skip
+        self._normals = self._accumulate(here, self._descent)
+        self._timings["refine"] = time.monotonic() - began
 
     def gate(self, here: Level) -> Generator[Progress, None, None]:
         """Before the finest level: how freely views may move from here on."""
@@ -313,7 +345,7 @@ class _Run:
         return accumulate(renderer, splats, motions.correct(static.apply(nominal)), images, here.mask, huber)
 
     def _advance(self, work: _Work, step: int) -> None:
-        total = sum(w.cost for w in self._works.values())
+        total = sum(w.cost for w in self._works.values()) + self._refining.cost
         self._fraction = 0.9 * (self._done + work.cost * step / work.steps) / total
 
     def _sweep(self, here: Level, descent: Descent) -> dict[str, float]:
@@ -357,13 +389,13 @@ class _Run:
 
     def finish(self) -> Generator[Progress, None, Reconstruction]:
         """Voxels, uncertainties and the report."""
-        assert self._splats is not None and self._normals is not None
+        assert self._descent is not None and self._normals is not None
         scan, options = self._scan, self._options
         corrected = self._corrected(scan.frames)
         yield self.progress("diagnose", "compare nominal and corrected geometry")
         result = conclude(
-            replace(scan, projections=self._exposure.corrected(scan.projections)), options, self._splats, corrected,
-            self._motions, self._static_entries(corrected), self._normals, self._sigmas(corrected),
+            replace(scan, projections=self._exposure.corrected(scan.projections)), options, self._descent.splats,
+            corrected, self._motions, self._static_entries(corrected), self._normals, self._sigmas(corrected),
             _GAUGE if options.calibrate == "full" else "nominal world kept", self._timings, self._began,
         )  # fmt: skip
         findings = result.report["findings"]
@@ -372,6 +404,8 @@ class _Run:
             findings.append(finding(self._exposure.offset))
         if self._decision is not None:
             findings.append(self._decision.finding())
+        if self._weighing is not None:
+            findings.append(self._weighing.finding())
         self._fraction = 1.0
         yield self.progress("done", result.report["verdict"])
         return result
@@ -393,11 +427,17 @@ class _Run:
         """Standard deviations of omega [views, 3] rad and tau [views, 3] mm; zero for what was not fitted."""
         if self._options.calibrate != "full":
             return np.zeros((len(corrected), 3)), np.zeros((len(corrected), 3))
-        assert self._splats is not None
+        assert self._descent is not None
         here = self._steady(level(self._scan, min(self._works)))
         huber = _HUBER * self._deviation or float(np.abs(here.images).max())
         covariance = pose_covariance(
-            self._splats, self._corrected(here.nominal), here.images, here.mask, huber, self._prior, self._threads
+            self._descent.splats,
+            self._corrected(here.nominal),
+            here.images,
+            here.mask,
+            huber,
+            self._prior,
+            self._threads,
         )
         omega, tau = np.split(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), 2, axis=1)
         if corrected.beam == "parallel":

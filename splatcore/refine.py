@@ -1,0 +1,144 @@
+"""The last stage of a reconstruction: the poses rest, the volume is refined alone.
+
+While poses move, the splats must follow the images and nothing else: a prior on the volume would bend the poses to
+it. Once they rest, the rates rise again and two things change. The loss becomes quadratic within the noise, which
+averages noise better than L1 does. And the volume may be asked for little total variation: an object of few sharp
+materials gains decibels by it, a smooth one loses. Views that took no part so far say which it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from splatcore.descent import Descent, Rates
+from splatcore.geometry import Frames
+from splatcore.pyramid import Level
+from splatcore.splats import Floats
+from splatcore.trial import Indices
+from splatcore.variation import Variation
+
+WEIGHTS = (0.0, 0.02, 0.05)  # of the total variation beside the mean loss; each is tried if the one before won
+_UNSEEN_WEIGHT = 0.02  # where no view can be left out: so few views need a prior
+_FORGET, _TRIAL_STEPS, _RESTING = 900, 400, 600
+_EVERY = 2  # steps of Adam to one of the variation, which is twice as strong then
+_REST = 0.15  # rates at the end of the stage before, of those at its beginning
+_HIGH = 0.9  # to which they rise again
+_CORNER = 1.345  # standard deviations: Huber's corner that is 95 % efficient on normal noise (Huber 1964)
+
+
+MOVING = Rates(end=_REST)  # of the stage before
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """How strong the variation is to be, and what it rests on."""
+
+    weight: float
+    residuals: tuple[tuple[float, float], ...] = ()  # weight, rms residual of the views left out
+    views: int = 0  # left out
+
+    def finding(self) -> dict[str, Any]:
+        """For the report (`splatcore.report`)."""
+        if not self.residuals:
+            text = f"Total variation counted with weight {self.weight:g}; no view could be left out to choose it."
+        else:
+            plain, best = self.residuals[0][1], dict(self.residuals)[self.weight]
+            gain = f"{1 - best / plain:.2%} better than without" if self.weight else "best without it"
+            text = f"Total variation counted with weight {self.weight:g}: views left out were predicted {gain}."
+        evidence = {f"residual_at_{weight:g}": rms for weight, rms in self.residuals}
+        return {
+            "name": "smoothness of the volume", "severity": "ok", "text": text,
+            "evidence": {"weight": self.weight, "held_out_views": self.views, **evidence},
+        }  # fmt: skip
+
+
+class Refinement:
+    """Adam on the volume alone, whatever the frames are at the moment."""
+
+    def __init__(self, descent: Descent, here: Level, views: Indices, weight: float, rng: np.random.Generator) -> None:
+        """descent: whose splats are moved; views: indices of those to draw."""
+        self.descent, self._here, self._views, self._rng = descent, here, views, rng
+        half = float(here.grid.half_extent_mm().max())
+        self._variation = Variation(here.grid, _EVERY * weight * half, descent.threads) if weight else None
+        self.step = 0
+
+    def epoch(self, frames: Frames, most: int) -> float:
+        """One step for every view, in random order, but no more than `most`. Returns the mean loss before them."""
+        packed, cone, here, loss = frames.packed(), frames.beam == "cone", self._here, 0.0
+        order = self._rng.permutation(self._views)[:most]
+        for view in order:
+            loss += self.descent.differentiate(packed[view], cone, here.images[view], here.mask)
+            self.step += 1
+            if self._variation and self.step % _EVERY == 0:
+                self._variation.add_gradient(self.descent.splats, self.descent.gradient, self._rng)
+            self.descent.update()
+        return loss / len(order)
+
+
+def weigh(descent: Descent, here: Level, frames: Frames, held: Indices, seed: int) -> tuple[Weighing, Descent]:
+    """The weight of the variation that best predicts views (indices) left out, and the descent to go on from.
+
+    First the splats forget those views: rates rise, the other views are drawn. Then short branches, one for each
+    weight, come to rest."""
+    if not len(held):
+        return Weighing(_UNSEEN_WEIGHT), descent
+    kept = np.setdiff1d(np.arange(len(frames)), held)
+    corner = _noise(descent, here, frames)
+    rng = np.random.default_rng(seed)
+    forgetful = descent.branch(_FORGET, MOVING, corner)
+    _run(Refinement(forgetful, here, kept, 0.0, rng), frames, _FORGET)
+    found: list[tuple[float, float]] = []
+    for weight in WEIGHTS:
+        branch = forgetful.branch(_TRIAL_STEPS, MOVING.times(_REST), corner)
+        _run(Refinement(branch, here, kept, weight, np.random.default_rng(seed)), frames, _TRIAL_STEPS)
+        unseen = np.mean([r @ r / r.size for r in _residuals(branch, here, frames, held)])
+        found.append((weight, float(np.sqrt(unseen))))
+        if len(found) > 1 and found[-1][1] >= found[-2][1]:
+            break
+    return Weighing(min(found, key=lambda pair: pair[1])[0], tuple(found), len(held)), forgetful
+
+
+def _run(refinement: Refinement, frames: Frames, steps: int) -> None:
+    while refinement.step < steps:
+        refinement.epoch(frames, steps - refinement.step)
+
+
+def begin(
+    descent: Descent,
+    weighed: tuple[Weighing, Descent],
+    here: Level,
+    frames: Frames,
+    steps: int,
+    rng: np.random.Generator,
+) -> tuple[Refinement, int]:
+    """The refinement with all views, and its number of steps: `steps` at most."""
+    weighing, forgetful = weighed
+    corner, views = _noise(descent, here, frames), np.arange(len(frames))
+    if weighing.weight:
+        branch = forgetful.branch(steps, Rates().times(_HIGH), corner)
+    else:
+        # What no prior holds would follow the noise if it went on: it comes to rest from where it is.
+        steps = min(steps, _RESTING)
+        branch = descent.branch(steps, MOVING.times(_REST), corner)
+    return Refinement(branch, here, views, weighing.weight, rng), steps
+
+
+def _noise(descent: Descent, here: Level, frames: Frames) -> float:
+    """Huber's corner for the residual of a few views, taken for noise. Line integral."""
+    views = np.arange(0, len(frames), max(1, len(frames) // 8))
+    size = np.mean([np.abs(r).mean() for r in _residuals(descent, here, frames, views)])
+    return max(_CORNER * 1.2533 * float(size), 1e-6 * float(here.images.max()))
+
+
+def _residuals(descent: Descent, here: Level, frames: Frames, views: Indices) -> Generator[Floats, None, None]:
+    """The residuals of the good pixels of each view. [pixels]"""
+    image = np.empty((frames.rows, frames.cols), np.float32)
+    good = np.ones(image.shape, bool) if here.mask is None else here.mask > 0
+    packed = frames.packed()
+    for view in views:
+        descent.renderer.render(packed[view], frames.beam == "cone", *descent.splats.arrays(), image)
+        yield (image - here.images[view])[good]
