@@ -35,7 +35,7 @@ from splatcore.progress import Progress
 from splatcore.pyramid import Level, factors, level
 from splatcore.reconstruction import Reconstruction
 from splatcore.redundancy import lopsidedness, orbit
-from splatcore.refine import MOVING, Weighing, begin, weigh
+from splatcore.refine import MOVING, Weighing, refine, weigh
 from splatcore.scan import Scan
 from splatcore.splats import Similarity
 from splatcore.start import first_splats
@@ -55,6 +55,7 @@ from splatcore.uncertainty import pose_covariance
 # Adam steps at each binning factor. Coarse steps cost a hundredth of fine ones.
 _STEPS = {8: 600, 4: 750, 2: 1200, 1: 2000}
 _REFINING = 3000  # of the last stage, poses at rest
+_MOST_EPOCHS = 200
 _QUALITY = {"preview": 1.0, "normal": 1.0, "fine": 1.5}
 _FINEST = {"preview": 2, "normal": 1, "fine": 1}
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
@@ -181,12 +182,13 @@ class _Run:
 
     def plan(self, scales: list[int]) -> None:
         """Steps and splats of each level: splats grow with the detail there is to see."""
+        quality, most = _QUALITY[self._options.quality], _MOST_EPOCHS * len(self._scan.frames)
         for factor in scales:
-            steps = int(_STEPS[factor] * _QUALITY[self._options.quality])
+            steps = int(min(_STEPS[factor], most) * quality)
             splats = max(min(1_500, self._most_splats), int(self._most_splats / factor**1.5))
             self._works[factor] = _Work(steps, splats)
         if self._options.quality != "preview":
-            self._refining = _Work(int(_REFINING * _QUALITY[self._options.quality]), self._works[scales[-1]].splats)
+            self._refining = _Work(int(min(_REFINING, most) * quality), self._works[scales[-1]].splats)
             self._held = held_out_views(len(self._scan.frames))
 
     def progress(self, stage: str, message: str, **facts: object) -> Progress:
@@ -264,15 +266,22 @@ class _Run:
         assert self._descent is not None
         began, work, here = time.monotonic(), self._refining, self._steady(here)
         frames = self._corrected(here.nominal)
-        weighed = weigh(self._descent, here, frames, self._held, self._options.seed)
-        run, steps = begin(self._descent, weighed, here, frames, work.steps, self._rng)
-        self._descent, self._weighing = run.descent, weighed[0]
-        while run.step < steps:
-            loss = run.epoch(frames, steps - run.step)
-            self._advance(work, run.step)
+        trial = weigh(self._descent, here, frames, self._held, self._options.seed)
+        while self._weighing is None:
+            try:
+                loss = next(trial)
+            except StopIteration as end:
+                self._weighing = end.value
+            else:
+                yield self.progress("refine", "how smooth is the object?", level=here.factor, loss=loss)
+        assert self._weighing is not None
+        refinement, steps = refine(self._weighing, here, frames, work.steps, self._rng)
+        self._descent = refinement.descent
+        for loss in refinement.run(frames, steps):
+            self._advance(work, refinement.step)
             yield self.progress(
-                "refine", f"step {run.step} of {steps}", level=here.factor, step=run.step, loss=loss,
-                splats=len(run.descent.splats),
+                "refine", f"step {refinement.step} of {steps}", level=here.factor, step=refinement.step, loss=loss,
+                splats=len(self._descent.splats),
             )  # fmt: skip
         self._normals = self._accumulate(here, self._descent)
         self._timings["refine"] = time.monotonic() - began

@@ -9,7 +9,7 @@ materials gains decibels by it, a smooth one loses. Views that took no part so f
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -35,9 +35,10 @@ MOVING = Rates(end=_REST)  # of the stage before
 
 @dataclass(frozen=True)
 class Weighing:
-    """How strong the variation is to be, and what it rests on."""
+    """How strong the variation is to be, what it rests on, and the descent to go on from."""
 
     weight: float
+    start: Descent = field(repr=False)
     residuals: tuple[tuple[float, float], ...] = ()  # weight, rms residual of the views left out
     views: int = 0  # left out
 
@@ -66,65 +67,53 @@ class Refinement:
         self._variation = Variation(here.grid, _EVERY * weight * half, descent.threads) if weight else None
         self.step = 0
 
-    def epoch(self, frames: Frames, most: int) -> float:
-        """One step for every view, in random order, but no more than `most`. Returns the mean loss before them."""
-        packed, cone, here, loss = frames.packed(), frames.beam == "cone", self._here, 0.0
-        order = self._rng.permutation(self._views)[:most]
-        for view in order:
-            loss += self.descent.differentiate(packed[view], cone, here.images[view], here.mask)
-            self.step += 1
-            if self._variation and self.step % _EVERY == 0:
-                self._variation.add_gradient(self.descent.splats, self.descent.gradient, self._rng)
-            self.descent.update()
-        return loss / len(order)
+    def run(self, frames: Frames, steps: int) -> Generator[float, None, None]:
+        """Until `step` is `steps`. Yields after every epoch (each view once, in random order) its mean loss."""
+        packed, cone, here = frames.packed(), frames.beam == "cone", self._here
+        while self.step < steps:
+            loss, order = 0.0, self._rng.permutation(self._views)[: steps - self.step]
+            for view in order:
+                loss += self.descent.differentiate(packed[view], cone, here.images[view], here.mask)
+                self.step += 1
+                if self._variation and self.step % _EVERY == 0:
+                    self._variation.add_gradient(self.descent.splats, self.descent.gradient, self._rng)
+                self.descent.update()
+            yield loss / len(order)
 
 
-def weigh(descent: Descent, here: Level, frames: Frames, held: Indices, seed: int) -> tuple[Weighing, Descent]:
-    """The weight of the variation that best predicts views (indices) left out, and the descent to go on from.
+def weigh(descent: Descent, here: Level, frames: Frames, held: Indices, seed: int) -> Generator[float, None, Weighing]:
+    """The weight of the variation that best predicts views (indices) left out. Yields losses.
 
     First the splats forget those views: rates rise, the other views are drawn. Then short branches, one for each
     weight, come to rest."""
     if not len(held):
-        return Weighing(_UNSEEN_WEIGHT), descent
+        return Weighing(_UNSEEN_WEIGHT, descent)
     kept = np.setdiff1d(np.arange(len(frames)), held)
-    corner = _noise(descent, here, frames)
-    rng = np.random.default_rng(seed)
+    corner, rng = _noise(descent, here, frames), np.random.default_rng(seed)
     forgetful = descent.branch(_FORGET, MOVING, corner)
-    _run(Refinement(forgetful, here, kept, 0.0, rng), frames, _FORGET)
+    yield from Refinement(forgetful, here, kept, 0.0, rng).run(frames, _FORGET)
     found: list[tuple[float, float]] = []
     for weight in WEIGHTS:
         branch = forgetful.branch(_TRIAL_STEPS, MOVING.times(_REST), corner)
-        _run(Refinement(branch, here, kept, weight, np.random.default_rng(seed)), frames, _TRIAL_STEPS)
+        yield from Refinement(branch, here, kept, weight, np.random.default_rng(seed)).run(frames, _TRIAL_STEPS)
         unseen = np.mean([r @ r / r.size for r in _residuals(branch, here, frames, held)])
         found.append((weight, float(np.sqrt(unseen))))
         if len(found) > 1 and found[-1][1] >= found[-2][1]:
             break
-    return Weighing(min(found, key=lambda pair: pair[1])[0], tuple(found), len(held)), forgetful
+    best = min(found, key=lambda pair: pair[1])[0]
+    return Weighing(best, forgetful if best else descent, tuple(found), len(held))
 
 
-def _run(refinement: Refinement, frames: Frames, steps: int) -> None:
-    while refinement.step < steps:
-        refinement.epoch(frames, steps - refinement.step)
-
-
-def begin(
-    descent: Descent,
-    weighed: tuple[Weighing, Descent],
-    here: Level,
-    frames: Frames,
-    steps: int,
-    rng: np.random.Generator,
+def refine(
+    weighing: Weighing, here: Level, frames: Frames, steps: int, rng: np.random.Generator
 ) -> tuple[Refinement, int]:
-    """The refinement with all views, and its number of steps: `steps` at most."""
-    weighing, forgetful = weighed
-    corner, views = _noise(descent, here, frames), np.arange(len(frames))
-    if weighing.weight:
-        branch = forgetful.branch(steps, Rates().times(_HIGH), corner)
-    else:
+    """The refinement with all views, yet to be run, and its number of steps: `steps` at most."""
+    rates = Rates().times(_HIGH)
+    if not weighing.weight:
         # What no prior holds would follow the noise if it went on: it comes to rest from where it is.
-        steps = min(steps, _RESTING)
-        branch = descent.branch(steps, MOVING.times(_REST), corner)
-    return Refinement(branch, here, views, weighing.weight, rng), steps
+        rates, steps = MOVING.times(_REST), min(steps, _RESTING)
+    branch = weighing.start.branch(steps, rates, _noise(weighing.start, here, frames))
+    return Refinement(branch, here, np.arange(len(frames)), weighing.weight, rng), steps
 
 
 def _noise(descent: Descent, here: Level, frames: Frames) -> float:

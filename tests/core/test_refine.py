@@ -1,0 +1,147 @@
+"""The last stage: held-out views choose how much total variation the volume gets, and no pose moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatcore.descent import Descent, Rates
+from splatcore.options import Options
+from splatcore.progress import Progress
+from splatcore.pyramid import level
+from splatcore.reconstruct import drain, reconstruct
+from splatcore.reconstruction import Reconstruction
+from splatcore.refine import MOVING, WEIGHTS, Weighing, refine
+from splatcore.scan import Scan, read_scan
+from splatcore.scores import psnr
+from splatcore.simulate import Simulation, simulate
+from splatcore.start import first_splats
+
+from .phantom import phantom
+
+EDGE = 32
+NOISY = Simulation(views=30, det=64, noise="r2", seed=2)
+FIXED = Options(calibrate="none", rotation="given", threads=1)
+
+
+def sharp() -> np.ndarray:
+    return (phantom(EDGE) > 0.3).astype(np.float32)
+
+
+def scan_of(volume: np.ndarray, folder: Path) -> Scan:
+    simulate(volume, folder, NOISY, threads=1, name="object")
+    return read_scan(folder)
+
+
+def weighing(result: Reconstruction) -> dict:
+    found = [finding for finding in result.report["findings"] if finding["name"] == "smoothness of the volume"]
+    assert len(found) == 1 and found[0]["text"]
+    return found[0]["evidence"]
+
+
+def descent_of(scan: Scan) -> Descent:
+    here = level(scan, 1)
+    splats, unit = first_splats(here.images, here.nominal, here.grid, 2000, np.random.default_rng(0), 1)
+    return Descent(
+        splats, 64, 64, voxel_mm=here.voxel_mm, density_unit=unit, steps=50, rates=Rates(), huber=1e-4, dssim=0.0,
+        data_range=1.0, threads=1,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def sharp_result(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scan, Reconstruction, list[Progress]]:
+    scan = scan_of(sharp(), tmp_path_factory.mktemp("sharp"))
+    events, run = [], reconstruct(scan, FIXED)
+    while True:
+        try:
+            events.append(next(run))
+        except StopIteration as end:
+            return scan, end.value, events
+
+
+def test_a_sharp_object_is_given_variation(sharp_result):
+    evidence = weighing(sharp_result[1])
+    assert evidence["weight"] > 0 and evidence["held_out_views"] == 4
+    assert evidence[f"residual_at_{evidence['weight']:g}"] < evidence["residual_at_0"]
+
+
+def test_a_weight_that_does_harm_is_refused(sharp_result, monkeypatch):
+    monkeypatch.setattr("splatcore.refine.WEIGHTS", (0.0, 5.0, 10.0))
+    evidence = weighing(drain(reconstruct(sharp_result[0], FIXED)))
+    assert evidence["weight"] == 0 and evidence["residual_at_5"] > evidence["residual_at_0"]
+    assert "residual_at_10" not in evidence  # not asked for more once less had lost
+
+
+def test_the_choice_is_the_better_volume(sharp_result, monkeypatch):
+    scan, chosen, _ = sharp_result
+    monkeypatch.setattr("splatcore.refine.WEIGHTS", (0.0,))
+    plain = drain(reconstruct(scan, FIXED))
+    truth = sharp() * np.float32(0.01)
+    assert psnr(chosen.volume, truth, 0.01) > psnr(plain.volume, truth, 0.01) + 0.5
+
+
+def test_the_last_stage_moves_no_view(tmp_path):
+    simulate(sharp(), tmp_path, replace(NOISY, views=16), threads=1, name="object")
+    events = list(reconstruct(read_scan(tmp_path), replace(FIXED, calibrate="full")))
+    last = [event for event in events if event.stage == "refine"]
+    assert len(last) > 10 and all(event.moved_deg is None for event in last)
+    assert any(event.moved_deg is not None for event in events)
+
+
+def test_progress_grows_through_it(sharp_result):
+    fractions = [event.fraction for event in sharp_result[2] if event.stage == "refine"]
+    assert fractions == sorted(fractions) and fractions[-1] > fractions[0] + 0.2
+
+
+def test_a_preview_does_without(tmp_path):
+    result = drain(reconstruct(scan_of(sharp(), tmp_path), replace(FIXED, quality="preview")))
+    assert not [finding for finding in result.report["findings"] if finding["name"] == "smoothness of the volume"]
+
+
+def test_too_few_views_to_hold_any_out_get_some(tmp_path):
+    simulate(sharp(), tmp_path, replace(NOISY, views=12), threads=1, name="few")
+    evidence = weighing(drain(reconstruct(read_scan(tmp_path), FIXED)))
+    assert evidence == {"weight": 0.02, "held_out_views": 0}
+    assert 0.02 in WEIGHTS
+
+
+def test_a_branch_goes_its_own_way(tmp_path):
+    scan = scan_of(sharp(), tmp_path)
+    here, trunk = level(scan, 1), descent_of(scan)
+    packed = here.nominal.packed()
+    for view in range(5):
+        trunk.step(packed[view], True, here.images[view], None)
+    before = [array.copy() for array in trunk.splats.arrays()]
+    branches = [trunk.branch(20, MOVING, 1e-3) for _ in range(2)]
+    for view in range(5, 10):
+        for branch in branches:
+            branch.step(packed[view], True, here.images[view], None)
+    for was, is_now in zip(before, trunk.splats.arrays(), strict=True):
+        np.testing.assert_array_equal(was, is_now)
+    for one, other in zip(branches[0].splats.arrays(), branches[1].splats.arrays(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert not np.array_equal(branches[0].splats.means, trunk.splats.means)
+
+
+def test_a_branch_keeps_its_momentum(tmp_path):
+    scan = scan_of(sharp(), tmp_path)
+    here, trunk = level(scan, 1), descent_of(scan)
+    frame = here.nominal.packed()[0]
+    for _ in range(5):
+        trunk.step(frame, True, here.images[0], None)
+    branch = trunk.branch(50, replace(Rates(), end=1.0), 1e-4)
+    trunk._rates, trunk._steps = replace(Rates(), end=1.0), 50  # so that nothing but the moments could differ
+    trunk.step(frame, True, here.images[0], None)
+    branch.step(frame, True, here.images[0], None)
+    np.testing.assert_array_equal(branch.splats.means, trunk.splats.means)
+
+
+def test_without_variation_it_soon_comes_to_rest(tmp_path):
+    scan = scan_of(sharp(), tmp_path)
+    here, trunk = level(scan, 1), descent_of(scan)
+    rng = np.random.default_rng(0)
+    assert refine(Weighing(0.0, trunk), here, here.nominal, 3000, rng)[1] == 600
+    assert refine(Weighing(0.02, trunk), here, here.nominal, 3000, rng)[1] == 3000
