@@ -124,8 +124,9 @@ def resolved(scan: Scan, options: Options) -> Options:
             "a view moves; use none"
         )
     threads = options.threads or threads_allowed()
-    edge = scan.volume.voxels ** (1 / 3)
-    splats = options.splats or int(np.clip(30_000 * (edge / 128) ** 1.5, 2_000, 2_000_000))
+    edge = scan.volume.voxels ** (1 / 3) / 128
+    # Finer voxels show more detail, but as few views hold it no better: past 128 many more splats would fit noise.
+    splats = options.splats or int(np.clip(30_000 * min(edge**1.5, edge**0.5), 2_000, 2_000_000))
     return replace(options, threads=threads, splats=splats)
 
 
