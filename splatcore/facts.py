@@ -196,7 +196,7 @@ def estimate(frames: Frames, grid: VolumeGrid) -> tuple[int, float]:
     grids of 128^3 and 256^3, on a processor with AVX-512."""
     pixels = len(frames) * frames.rows * frames.cols
     memory = 400e6 + 4 * (3 * pixels + 4 * grid.voxels)
-    seconds = 30 * (pixels / (75 * 256**2)) ** 0.85 * max(1.0, grid.voxels / max(pixels, 1)) ** 0.5
+    seconds = 45 * (pixels / (75 * 256**2)) ** 0.85 * max(1.0, grid.voxels / max(pixels, 1)) ** 0.5
     return int(memory), round(max(5.0, seconds), 1)
 
 
