@@ -1,4 +1,4 @@
-"""Routes about jobs: submit, watch, cancel, forget."""
+"""Routes about jobs: submit, list, cancel, forget. Those for who waits for one are in `server.follow`."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from uuid import UUID, uuid4
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 
+from server.answers import job_out, retry_after
 from server.problems import ApiProblem, invalid, not_found
 from server.schema import EventList, JobIn, JobList, JobOut
 from server.service import Served, Service
 from splatcore.errors import OptionsError, Problem
 from splatcore.options import Options, describe
-from worker.contract import FINISHED, State
+from worker.contract import State
 from worker.journal import read_events
 from worker.ledger import Job
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
 MOST_EVENTS = 5000
-_POLL_S = {State.QUEUED: 5}  # all others: 1
 
 
 @router.get("/options")
@@ -63,12 +63,7 @@ def list_jobs(
     jobs = service.store.jobs.page(state, limit + 1, None if before is None else service.job(before))
     more = len(jobs) > limit
     jobs = jobs[:limit]
-    return JobList(jobs=[_out(service, job) for job in jobs], next=jobs[-1].id if more else None)
-
-
-@router.get("/jobs/{job_id}")
-def get_job(job_id: UUID, service: Served, response: Response) -> JobOut:
-    return _answer(service, service.job(job_id), response)
+    return JobList(jobs=[job_out(service, job) for job in jobs], next=jobs[-1].id if more else None)
 
 
 @router.post("/jobs/{job_id}/cancel", status_code=202)
@@ -102,11 +97,6 @@ def get_log(job_id: UUID, service: Served) -> Response:
     return FileResponse(log, media_type="text/plain")
 
 
-def _out(service: Service, job: Job) -> JobOut:
-    return JobOut.of(job, service.store.jobs.position(job) if job.state is State.QUEUED else None)
-
-
 def _answer(service: Service, job: Job, response: Response) -> JobOut:
-    if job.state not in FINISHED:
-        response.headers["Retry-After"] = str(_POLL_S.get(job.state, 1))
-    return _out(service, job)
+    response.headers.update(retry_after(job.state))
+    return job_out(service, job)

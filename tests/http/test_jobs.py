@@ -72,6 +72,7 @@ UNKNOWN = [
     ("DELETE", "/v1/jobs/{}"),
     ("POST", "/v1/jobs/{}/cancel"),
     ("GET", "/v1/jobs/{}/events"),
+    ("GET", "/v1/jobs/{}/events/stream"),
     ("GET", "/v1/jobs/{}/log"),
     ("GET", "/v1/jobs/{}/results"),
     ("GET", "/v1/jobs/{}/results/volume.tif"),
