@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from typing import Annotated, Any
-from uuid import UUID, uuid4
+from uuid import UUID
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 
 from server.answers import job_out, retry_after
-from server.problems import ApiProblem, invalid, not_found
+from server.problems import ApiProblem, not_found
 from server.schema import EventList, JobIn, JobList, JobOut
 from server.service import Served, Service
-from splatcore.errors import OptionsError, Problem
-from splatcore.options import Options, describe
+from server.submit import submit, submit_as
+from splatcore.options import describe
 from worker.contract import State
 from worker.journal import read_events
 from worker.ledger import Job
@@ -28,28 +28,20 @@ def get_options() -> dict[str, list[dict[str, Any]]]:
     return {"options": describe()}
 
 
+IdempotencyKey = Annotated[
+    str | None, Header(pattern=r"^[!-~]{1,255}$", description="the same key with the same body: the same job, for 24 h")
+]
+
+
 @router.post("/jobs", status_code=202)
-def submit_job(body: JobIn, service: Served, response: Response) -> JobOut:
-    scan = service.store.scan(str(body.scan_id))
-    if scan is None:
-        raise invalid("There is no such scan.", [Problem("scan_id", "names no committed scan")])
-    try:
-        options = Options.from_dict(body.options)
-    except OptionsError as error:
-        raise invalid("An option cannot be used.", [Problem("options", str(error))]) from None
-    job_id = str(uuid4())
-    folder = service.folder(job_id)
-    try:
-        folder.create(service.intake.scan_folder(scan.id))
-        queued = service.store.add_job(job_id, body.name or scan.name, scan, options.to_dict())
-    except FileNotFoundError:
-        queued = False
-    if not queued:
-        folder.remove()
-        raise invalid("There is no such scan.", [Problem("scan_id", "was deleted just now")])
-    service.wake()
-    response.headers["Location"] = f"/v1/jobs/{job_id}"
-    return _answer(service, service.job(UUID(job_id)), response)
+def submit_job(body: JobIn, service: Served, response: Response, idempotency_key: IdempotencyKey = None) -> JobOut:
+    return _submitted(service, response, *submit(service, body, idempotency_key))
+
+
+@router.put("/jobs/{job_id}", status_code=202)
+def put_job(job_id: UUID, body: JobIn, service: Served, response: Response) -> JobOut:
+    """Submit under an id of the client's own. Repeated with the same body: the job; with another: 409."""
+    return _submitted(service, response, *submit_as(service, body, job_id))
 
 
 @router.get("/jobs")
@@ -95,6 +87,13 @@ def get_log(job_id: UUID, service: Served) -> Response:
     if not log.exists():
         return PlainTextResponse("")
     return FileResponse(log, media_type="text/plain")
+
+
+def _submitted(service: Service, response: Response, job: Job, replayed: bool) -> JobOut:
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    if replayed:
+        response.headers["Idempotency-Replayed"] = "true"
+    return _answer(service, job, response)
 
 
 def _answer(service: Service, job: Job, response: Response) -> JobOut:
