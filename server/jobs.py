@@ -69,6 +69,7 @@ def cancel_job(job_id: UUID, service: Served, response: Response) -> JobOut:
 @router.delete("/jobs/{job_id}", status_code=204)
 def delete_job(job_id: UUID, service: Served) -> None:
     service.job(job_id)
+    service.outcomes.catch_up()
     if not service.store.jobs.forget(str(job_id)):
         raise ApiProblem(409, "not-finished", "The job has not finished; cancel it first.")
     service.folder(str(job_id)).remove()

@@ -9,6 +9,7 @@ from uuid import UUID
 
 from fastapi import Depends, Request
 
+from server.census import Outcomes
 from server.intake import Intake
 from server.problems import not_found
 from server.settings import Settings
@@ -24,6 +25,7 @@ class Service:
     store: Store
     intake: Intake
     watch: Watch
+    outcomes: Outcomes
     wake: Callable[[], None]  # have the reconcile loop look at once
 
     def folder(self, job_id: str) -> JobFolder:

@@ -23,6 +23,7 @@ def run(args: argparse.Namespace) -> int:
 
     import uvicorn
 
+    from server import logs
     from server.app import create_app
     from server.settings import Settings
     from worker.lifeline import die_with_parent
@@ -33,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     settings = Settings.read(given)
     settings.require_loopback()
     os.umask(0o077)
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    logs.configure(settings.log_format)
     logging.getLogger("splatct.server").info("http://%s:%d, data in %s", settings.host, settings.port, settings.data)
     app = create_app(settings)
 
