@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator
 from typing import Annotated
 from uuid import UUID
 
-from fastapi import APIRouter, Depends, Header, Query, Response
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
@@ -19,11 +19,13 @@ from server.answers import job_out, retry_after
 from server.etags import matches, weak_etag
 from server.schema import JobOut
 from server.service import Served, Service
+from server.watch import Eye
 from worker.contract import FINISHED
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
 LONGEST_S = 60
+_STILL_THERE_S = 2.0  # how often we ask whether the caller is: who has left must not take a place
 
 
 @router.get(
@@ -33,6 +35,7 @@ LONGEST_S = 60
 )
 async def get_job(
     job_id: UUID,
+    request: Request,
     service: Served,
     response: Response,
     wait: Annotated[float, Query(ge=0, le=LONGEST_S, description="seconds to wait for a change")] = 0,
@@ -42,7 +45,7 @@ async def get_job(
     out = await run_in_threadpool(_now, service, job_id)
     known = if_none_match or weak_etag(out)
     if wait and out.state not in FINISHED and matches(known, weak_etag(out)):
-        out = await _changed(service, out, known, wait)
+        out = await _changed(request, service, out, known, wait)
     headers = {"ETag": weak_etag(out), "Cache-Control": "no-cache", **retry_after(out.state)}
     if matches(if_none_match, headers["ETag"]):
         return Response(status_code=304, headers=headers)
@@ -50,20 +53,22 @@ async def get_job(
     return out
 
 
-async def _known(job_id: UUID, service: Served) -> str:
-    """The job's id, or a 404 before the stream begins."""
-    return (await run_in_threadpool(service.job, job_id)).id
+async def _following(job_id: UUID, service: Served) -> AsyncIterator[Eye]:
+    """An eye on the job as long as the stream lasts; a 404 or 503 before it begins."""
+    job = await run_in_threadpool(service.job, job_id)
+    with service.watch.on(job.id, events=True) as eye:
+        yield eye
 
 
 @router.get("/jobs/{job_id}/events/stream", response_class=EventSourceResponse)
 async def stream_events(
-    known_id: Annotated[str, Depends(_known)],
+    eye: Annotated[Eye, Depends(_following)],
     service: Served,
     after: Annotated[int, Query(ge=0)] = 0,
     last_event_id: Annotated[int | None, Header(ge=0)] = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """Events numbered above `Last-Event-ID` (or `after`) as they come; `end`, with the job, is the last."""
-    async for event in stream.follow(service, known_id, after if last_event_id is None else last_event_id):
+    async for event in stream.follow(service, eye, after if last_event_id is None else last_event_id):
         yield event
 
 
@@ -71,13 +76,15 @@ def _now(service: Service, job_id: UUID) -> JobOut:
     return job_out(service, service.job(job_id))
 
 
-async def _changed(service: Service, out: JobOut, known: str, wait_s: float) -> JobOut:
+async def _changed(request: Request, service: Service, out: JobOut, known: str, wait_s: float) -> JobOut:
     """The job once it differs from `known`, or as it is when the time is over."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + wait_s
     with service.watch.on(out.id) as eye:
         while (left := deadline - loop.time()) > 0:
-            sight = await eye.news(left)
+            sight = await eye.news(min(left, _STILL_THERE_S))
+            if sight is None and not service.watch.closed and not await request.is_disconnected():
+                continue
             if sight is None or sight.job is None:
                 break
             out = JobOut.of(sight.job, sight.queue_position)

@@ -65,9 +65,15 @@ class Submissions:
 
     def add(self, write: sa.Connection, claim: Claim, job_id: str) -> None:
         """Within the caller's transaction. Raises IntegrityError if another took the name first."""
-        write.execute(submissions.delete().where(_outdated()))
-        row = {"kind": claim.kind.value, "name": claim.name, "digest": claim.digest}
-        write.execute(submissions.insert().values(**row, job_id=job_id, created_at=time.time()))
+        row = {"kind": claim.kind.value, "name": claim.name}
+        mine = sa.and_(submissions.c.kind == claim.kind.value, submissions.c.name == claim.name)
+        write.execute(submissions.delete().where(mine, _outdated()))
+        write.execute(submissions.insert().values(**row, digest=claim.digest, job_id=job_id, created_at=time.time()))
+
+    def purge(self) -> None:
+        """Forget what is not remembered any more. Apart from `add`, where two at once might lock each other out."""
+        with self._database.writing() as write:
+            write.execute(submissions.delete().where(_outdated()))
 
 
 def _outdated() -> sa.ColumnElement[bool]:

@@ -1,5 +1,5 @@
 """One pair of eyes for all who wait: looks at the watched jobs twice a second, in one thread for a moment,
-and wakes those whose job has changed. A thousand who wait cost one query, and no thread of the pool.
+and wakes those whose job has changed. Hundreds who wait cost one query, and no thread of the pool.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ log = logging.getLogger("splatct.server")
 
 EVERY_S = 0.5
 LEAST_S = 0.05  # between two looks, however many newcomers ask for one
-MOST_EYES = 1000
+MOST_EYES = 500  # each is an open connection, of which a process commonly may have 1,024
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ class Sight:
 class Eye:
     """One who waits for news of one job."""
 
-    def __init__(self, watched: _Watched) -> None:
+    def __init__(self, job_id: str, watched: _Watched) -> None:
+        self.job_id = job_id
         self._watched = watched
         self._bell = asyncio.Event()
         if watched.sight is not None:
@@ -89,7 +90,7 @@ class Watch:
         if events and watched.tail is None:
             watched.tail = Tail(JobFolder(self._data, job_id).events)
             watched.sight = None  # what was seen so far says nothing of the events: look at both together
-        eye = Eye(watched)
+        eye = Eye(job_id, watched)
         watched.eyes.add(eye)
         if watched.sight is None:
             self._newcomer.set()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import quote, urlsplit
+from uuid import uuid4
 
 import httpx
 
@@ -33,7 +34,7 @@ class Client:
     """A connection to one server. Use it as a context manager, from one thread.
 
     Calls are repeated for `patience` while the server is away or overloaded; what must not
-    happen twice (a new upload, a new job) only if the server cannot have done it. A server that
+    happen twice (a new upload) only if the server cannot have done it. A server that
     never answered at all is reported at once.
     """
 
@@ -124,7 +125,12 @@ class Client:
         body: dict[str, Any] = {"scan_id": scan_id, "options": options or {}}
         if name is not None:
             body["name"] = name
-        return Job.from_json(self._json("POST", "/v1/jobs", json=body, repeatable=False))
+        try:  # under an id of our own it can be repeated until there is an answer, and there is one job
+            return Job.from_json(self._json("PUT", f"/v1/jobs/{uuid4()}", json=body))
+        except ServerProblem as problem:
+            if problem.status != 405:
+                raise
+        return Job.from_json(self._json("POST", "/v1/jobs", json=body, repeatable=False))  # an older server
 
     def job(self, job_id: str) -> Job:
         return Job.from_json(self._json("GET", f"/v1/jobs/{_id(job_id)}"))

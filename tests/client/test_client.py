@@ -72,12 +72,24 @@ def test_patience_ends(client, api, sleeps):
     assert 30 < sum(sleeps) <= 60
 
 
-def test_a_job_is_never_submitted_twice(client, api):
+def test_a_submission_is_repeated_under_the_same_id(client, api):
     client.options()
+    api.faults = [("PUT /v1/jobs", httpx.ReadTimeout("slow")), ("PUT /v1/jobs", (500, {}, b""))]
+    assert client.submit("scan-1").id == JOB_ID
+    puts = [call for call in api.calls if call.startswith("PUT")]
+    assert len(puts) == 3 and len(set(puts)) == 1 and len(api.submitted) == 1
+    client.submit("scan-1")
+    assert api.calls[-1] not in puts, "another submission, another id"
+
+
+def test_an_older_server_is_never_sent_a_job_twice(client, api):
+    client.options()
+    api.takes_ids = False
+    assert client.submit("scan-1").id == JOB_ID
     api.faults = [("POST /v1/jobs", httpx.ReadTimeout("slow"))]
     with pytest.raises(ServerUnreachable):
         client.submit("scan-1")
-    assert api.calls.count("POST /v1/jobs") == 1
+    assert api.calls.count("POST /v1/jobs") == 2
 
 
 def test_a_server_that_never_answered_is_reported_at_once(client, api, sleeps):

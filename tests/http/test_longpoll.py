@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -9,6 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 import httpx
 import pytest
 from splatct_client.client import Client
+
+from server.watch import MOST_EYES
 
 from .stack import Stack, commit, scan_files, submit
 
@@ -87,6 +90,32 @@ def test_a_hundred_who_wait_occupy_no_thread(idle: Stack) -> None:
         assert time.monotonic() - began < 2 and not any(poll.done() for poll in polls)
         idle.http.post(f"/v1/jobs/{job_id}/cancel")
         assert {poll.result(20).json()["state"] for poll in polls} == {"cancelled"}
+
+
+def test_more_than_the_server_can_hold_are_told_to_come_back(stack: Stack) -> None:
+    url = f"/v1/jobs/{queued(stack)}"
+    request = f"GET {url}?wait=60 HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode()
+    waiting: list[socket.socket] = []
+
+    def one_more() -> None:
+        waiting.append(socket.create_connection(("127.0.0.1", stack.port)))
+        waiting[-1].sendall(request)
+
+    def full() -> bool:
+        one_more()  # an earlier look may have taken the place of one of them
+        return stack.http.get(f"{url}?wait=0.1").status_code == 503
+
+    for _ in range(MOST_EYES):
+        one_more()
+    stack.until(full, what="all places are taken")
+    for more in (f"{url}?wait=5", f"{url}/events/stream"):
+        answer = stack.http.get(more)
+        assert answer.status_code == 503 and answer.headers["retry-after"] == "15"
+        assert answer.headers["content-type"] == "application/problem+json"
+    assert stack.http.get(url).status_code == 200, "who does not wait is answered"
+    for connection in waiting:
+        connection.close()
+    stack.until(lambda: stack.http.get(f"{url}?wait=0.1").status_code == 200, what="their places are free again")
 
 
 def test_the_client_waits_with_few_requests(shared: Stack) -> None:

@@ -170,6 +170,7 @@ def test_keys_are_forgotten_after_a_day_and_ids_with_their_jobs(tmp_path: Path) 
     found = {job_id: store.submissions.find(claim) is not None for job_id, claim in names.items()}
     assert found == {"key": False, "kept": True, "gone": False}
     assert store.add_job(NewJob("new", "new", {}, Claim(Kind.KEY, "a", "e")), scan, lambda: None)
+    store.submissions.purge()
     with database.reading() as read:
         assert sorted(read.execute(sa.select(submissions.c.name)).scalars()) == ["a", "b"]
     database.close()
