@@ -92,6 +92,7 @@ def test_a_hundred_who_wait_occupy_no_thread(idle: Stack) -> None:
         assert {poll.result(20).json()["state"] for poll in polls} == {"cancelled"}
 
 
+@pytest.mark.slow
 def test_more_than_the_server_can_hold_are_told_to_come_back(stack: Stack) -> None:
     url = f"/v1/jobs/{queued(stack)}"
     request = f"GET {url}?wait=60 HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode()

@@ -83,6 +83,7 @@ def test_a_failed_and_a_cancelled_job_end_the_stream_too(shared: Stack) -> None:
     shared.wait(running, "cancelled")
 
 
+@pytest.mark.slow
 def test_readers_that_stall_or_vanish_hold_up_nobody(stack: Stack) -> None:
     """A journal of 30,000 events does not fit into the socket of a reader that never reads."""
     job_id = submit(stack.http, commit(stack.http, scan_files()))
