@@ -11,14 +11,18 @@ from typing import Any
 from fastapi import FastAPI, Response
 from fastapi.staticfiles import StaticFiles
 
-from server import health, janitor, jobs, pages, problems, results, scans, uploads
+from server import follow, health, janitor, jobs, metrics, pages, problems, results, scans, uploads
+from server.census import Census, Outcomes
 from server.dispatch import Dispatcher
 from server.guard import Guard
 from server.intake import Intake
+from server.metrics import JobNumbers, Metrics
+from server.observe import Observer
 from server.reconcile import Reconciler, keep_reconciling
 from server.service import Service
 from server.settings import Settings
 from server.store import Store
+from server.watch import Watch
 from worker.database import Database
 
 
@@ -42,16 +46,20 @@ def create_app(settings: Settings) -> FastAPI:
         database.create_tables()
         store, intake = Store(database), Intake(settings.data)
         dispatcher = Dispatcher(settings.redis_url)
+        watch = Watch(store.jobs, settings.data)
         reconciler = Reconciler(store.jobs, dispatcher, settings.data)
+        outcomes = Outcomes(database)
         loop, wake = asyncio.get_running_loop(), asyncio.Event()
 
         def wake_up() -> None:
             loop.call_soon_threadsafe(wake.set)
 
-        app.state.service = Service(settings, store, intake, wake_up)
+        app.state.service = Service(settings, store, intake, watch, outcomes, wake_up)
+        app.state.metrics = Metrics(JobNumbers(Census(database), outcomes, reconciler, settings.data))
         app.state.dispatcher = dispatcher
         tasks = [
             asyncio.create_task(keep_reconciling(reconciler, settings.reconcile_s, wake)),
+            asyncio.create_task(watch.keep_looking()),
             asyncio.create_task(janitor.keep_clean(store, intake, settings.data, settings.stale_upload_hours * 3600.0)),
         ]
         try:
@@ -73,7 +81,8 @@ def create_app(settings: Settings) -> FastAPI:
     )
     problems.install(app)
     app.add_middleware(Guard)
-    for part in (uploads, scans, jobs, results, health):
+    app.add_middleware(Observer)
+    for part in (uploads, scans, jobs, follow, results, health, metrics):
         app.include_router(part.router)
     app.include_router(pages.router)
     app.mount("/static", _Static(directory=Path(__file__).parent / "static"), name="static")

@@ -1,4 +1,4 @@
-"""Removes what nobody will come back for: stale uploads, and folders without a row.
+"""Removes what nobody will come back for: stale uploads, outdated submission keys, and folders without a row.
 
 A folder is made before its row and removed after it, so a crash leaves folders, never rows without
 one. They are given an hour, because a request may be between the two steps right now.
@@ -22,6 +22,7 @@ ORPHAN_AGE_S = 3600.0
 
 
 def sweep(store: Store, intake: Intake, data: Path, stale_upload_s: float, now: float) -> None:
+    store.submissions.purge()
     for upload_id in store.stale_uploads(now - stale_upload_s):
         try:
             with intake.alone(upload_id, 0.0):

@@ -1,26 +1,26 @@
-"""Routes about jobs: submit, watch, cancel, forget."""
+"""Routes about jobs: submit, list, cancel, forget. Those for who waits for one are in `server.follow`."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any
-from uuid import UUID, uuid4
+from uuid import UUID
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 
-from server.problems import ApiProblem, invalid, not_found
+from server.answers import job_out, retry_after
+from server.problems import ApiProblem, not_found
 from server.schema import EventList, JobIn, JobList, JobOut
 from server.service import Served, Service
-from splatcore.errors import OptionsError, Problem
-from splatcore.options import Options, describe
-from worker.contract import FINISHED, State
+from server.submit import submit, submit_as
+from splatcore.options import describe
+from worker.contract import State
 from worker.journal import read_events
 from worker.ledger import Job
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
 MOST_EVENTS = 5000
-_POLL_S = {State.QUEUED: 5}  # all others: 1
 
 
 @router.get("/options")
@@ -28,28 +28,20 @@ def get_options() -> dict[str, list[dict[str, Any]]]:
     return {"options": describe()}
 
 
+IdempotencyKey = Annotated[
+    str | None, Header(pattern=r"^[!-~]{1,255}$", description="the same key with the same body: the same job, for 24 h")
+]
+
+
 @router.post("/jobs", status_code=202)
-def submit_job(body: JobIn, service: Served, response: Response) -> JobOut:
-    scan = service.store.scan(str(body.scan_id))
-    if scan is None:
-        raise invalid("There is no such scan.", [Problem("scan_id", "names no committed scan")])
-    try:
-        options = Options.from_dict(body.options)
-    except OptionsError as error:
-        raise invalid("An option cannot be used.", [Problem("options", str(error))]) from None
-    job_id = str(uuid4())
-    folder = service.folder(job_id)
-    try:
-        folder.create(service.intake.scan_folder(scan.id))
-        queued = service.store.add_job(job_id, body.name or scan.name, scan, options.to_dict())
-    except FileNotFoundError:
-        queued = False
-    if not queued:
-        folder.remove()
-        raise invalid("There is no such scan.", [Problem("scan_id", "was deleted just now")])
-    service.wake()
-    response.headers["Location"] = f"/v1/jobs/{job_id}"
-    return _answer(service, service.job(UUID(job_id)), response)
+def submit_job(body: JobIn, service: Served, response: Response, idempotency_key: IdempotencyKey = None) -> JobOut:
+    return _submitted(service, response, *submit(service, body, idempotency_key))
+
+
+@router.put("/jobs/{job_id}", status_code=202)
+def put_job(job_id: UUID, body: JobIn, service: Served, response: Response) -> JobOut:
+    """Submit under an id of the client's own. Repeated with the same body: the job; with another: 409."""
+    return _submitted(service, response, *submit_as(service, body, job_id))
 
 
 @router.get("/jobs")
@@ -63,12 +55,7 @@ def list_jobs(
     jobs = service.store.jobs.page(state, limit + 1, None if before is None else service.job(before))
     more = len(jobs) > limit
     jobs = jobs[:limit]
-    return JobList(jobs=[_out(service, job) for job in jobs], next=jobs[-1].id if more else None)
-
-
-@router.get("/jobs/{job_id}")
-def get_job(job_id: UUID, service: Served, response: Response) -> JobOut:
-    return _answer(service, service.job(job_id), response)
+    return JobList(jobs=[job_out(service, job) for job in jobs], next=jobs[-1].id if more else None)
 
 
 @router.post("/jobs/{job_id}/cancel", status_code=202)
@@ -82,6 +69,7 @@ def cancel_job(job_id: UUID, service: Served, response: Response) -> JobOut:
 @router.delete("/jobs/{job_id}", status_code=204)
 def delete_job(job_id: UUID, service: Served) -> None:
     service.job(job_id)
+    service.outcomes.catch_up()
     if not service.store.jobs.forget(str(job_id)):
         raise ApiProblem(409, "not-finished", "The job has not finished; cancel it first.")
     service.folder(str(job_id)).remove()
@@ -102,11 +90,13 @@ def get_log(job_id: UUID, service: Served) -> Response:
     return FileResponse(log, media_type="text/plain")
 
 
-def _out(service: Service, job: Job) -> JobOut:
-    return JobOut.of(job, service.store.jobs.position(job) if job.state is State.QUEUED else None)
+def _submitted(service: Service, response: Response, job: Job, replayed: bool) -> JobOut:
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    if replayed:
+        response.headers["Idempotency-Replayed"] = "true"
+    return _answer(service, job, response)
 
 
 def _answer(service: Service, job: Job, response: Response) -> JobOut:
-    if job.state not in FINISHED:
-        response.headers["Retry-After"] = str(_POLL_S.get(job.state, 1))
-    return _out(service, job)
+    response.headers.update(retry_after(job.state))
+    return job_out(service, job)

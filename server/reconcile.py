@@ -33,6 +33,7 @@ class Reconciler:
         self._host = host_id()
         self._pulse: dict[tuple[str, int], tuple[float | None, float]] = {}  # last heartbeat, when it was new to us
         self._redis_was_away = False
+        self.recoveries = 0  # jobs taken from a dead worker, since the start
 
     def sweep(self) -> None:
         """One look at everything that is not finished."""
@@ -61,6 +62,7 @@ class Reconciler:
         job = self._ledger.get(seen.id)
         if job is None or (job.state, job.attempt) != (seen.state, seen.attempt):
             return  # its worker came to an end by itself meanwhile
+        self.recoveries += 1
         log.warning("job %s: the worker of attempt %d is gone", job.id, job.attempt)
         if job.state is State.CANCELLING:
             folder.discard_results()

@@ -141,6 +141,7 @@ def moment(seconds: float) -> datetime:
 def _job_links(job: Job) -> dict[str, str]:
     base = f"/v1/jobs/{job.id}"
     links = {"self": base, "scan": f"/v1/scans/{job.scan_id}", "events": f"{base}/events", "log": f"{base}/log"}
+    links["stream"] = f"{base}/events/stream"
     if job.state is State.SUCCEEDED:
         links |= {"results": f"{base}/results", "report": f"{base}/report"}
     elif job.state in (State.QUEUED, State.RUNNING):

@@ -9,10 +9,12 @@ from uuid import UUID
 
 from fastapi import Depends, Request
 
+from server.census import Outcomes
 from server.intake import Intake
 from server.problems import not_found
 from server.settings import Settings
 from server.store import Store
+from server.watch import Watch
 from worker.jobfolder import JobFolder
 from worker.ledger import Job
 
@@ -22,6 +24,8 @@ class Service:
     settings: Settings
     store: Store
     intake: Intake
+    watch: Watch
+    outcomes: Outcomes
     wake: Callable[[], None]  # have the reconcile loop look at once
 
     def folder(self, job_id: str) -> JobFolder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+from typing import Literal
 
 from pydantic import Field
 
@@ -23,6 +24,7 @@ class Settings(WorkerSettings):
     disk_floor_mib: int = 512  # kept free: no upload may take the last of the disk
     stale_upload_hours: float = 48.0
     reconcile_s: float = 2.0
+    log_format: Literal["json", "text"] = "json"
 
     def require_loopback(self) -> None:
         """Refuse an address others could reach: there are no keys yet, so whoever connects may do all.

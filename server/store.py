@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 from uuid import uuid4
 
 import sqlalchemy as sa
 
+from server.submissions import Claim, Submissions
 from worker.database import Database, metadata
 from worker.ledger import Ledger
 
@@ -74,12 +75,21 @@ class Scan:
     created_at: float
 
 
+@dataclass(frozen=True)
+class NewJob:
+    id: str
+    name: str
+    options: dict[str, Any]
+    claim: Claim | None = None
+
+
 class Store:
     """Everything the server keeps, on one database."""
 
     def __init__(self, database: Database) -> None:
         self.database = database
         self.jobs = Ledger(database)
+        self.submissions = Submissions(database)
 
     # Uploads
 
@@ -181,10 +191,17 @@ class Store:
 
     # Jobs
 
-    def add_job(self, job_id: str, name: str, scan: Scan, options: dict[str, Any]) -> bool:
-        """Queue a job; False if the scan was deleted meanwhile. One transaction with `drop_scan`'s check."""
+    def add_job(self, job: NewJob, scan: Scan, place: Callable[[], None]) -> bool:
+        """Queue a job; False if the scan was deleted meanwhile. One transaction with `drop_scan`'s check.
+
+        `place` puts the job's folder where it belongs, once id and claim are ours and before others see them.
+        Raises IntegrityError if another request took either.
+        """
         with self.database.writing() as write:
             if write.execute(sa.select(scans.c.id).where(scans.c.id == scan.id)).first() is None:
                 return False
-            self.jobs.add(write, job_id, name, (scan.id, scan.name), options)
+            self.jobs.add(write, job.id, job.name, (scan.id, scan.name), job.options)
+            if job.claim is not None:
+                self.submissions.add(write, job.claim, job.id)
+            place()
             return True

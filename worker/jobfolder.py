@@ -83,6 +83,12 @@ class JobFolder:
         for folder in (self.scan, self.path, self.path.parent):
             sync_folder(folder)
 
+    def become(self, other: JobFolder) -> None:
+        """Take the place of `other`, where only a request that was cut short may have left something."""
+        other.remove()
+        self.path.rename(other.path)
+        sync_folder(other.path.parent)
+
     def attempt(self, number: int) -> Path:
         return self.path / f"attempt-{number}"
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -46,6 +47,38 @@ def read_events(path: Path, after: int, limit: int) -> list[dict[str, Any]]:
     except FileNotFoundError:
         pass
     return events
+
+
+@dataclass(frozen=True)
+class Line:
+    number: int
+    text: str
+
+
+class Cursor:
+    """A reader that remembers where it stopped, so that following a journal does not read it again and again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+        self._number = 0
+
+    def read(self, limit: int, after: int = 0) -> list[Line]:
+        """Up to `limit` of the next lines, those numbered `after` and below passed over."""
+        lines: list[Line] = []
+        try:
+            with self._path.open("rb") as file:
+                file.seek(self._offset)
+                for raw in file:
+                    if not raw.endswith(b"\n") or len(lines) >= limit:
+                        break
+                    self._offset += len(raw)
+                    self._number += 1
+                    if self._number > after:
+                        lines.append(Line(self._number, raw.decode().rstrip("\n")))
+        except FileNotFoundError:
+            pass
+        return lines
 
 
 def _whole_lines(path: Path) -> tuple[int, int]:

@@ -101,6 +101,17 @@ class Ledger:
         with self._database.reading() as read:
             return [_job(row) for row in read.execute(query)]
 
+    def many(self, ids: list[str]) -> list[Job]:
+        """Those of `ids` that there are."""
+        with self._database.reading() as read:
+            return [_job(row) for row in read.execute(sa.select(jobs).where(jobs.c.id.in_(ids)))]
+
+    def queue(self) -> list[str]:
+        """The ids of the queued jobs in the order of `position`."""
+        query = sa.select(jobs.c.id).where(jobs.c.state == State.QUEUED).order_by(jobs.c.created_at, jobs.c.id)
+        with self._database.reading() as read:
+            return list(read.execute(query).scalars())
+
     def position(self, job: Job) -> int:
         """1 for the queued job that is next."""
         ahead = sa.tuple_(jobs.c.created_at, jobs.c.id) < (job.created_at, job.id)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import quote, urlsplit
+from uuid import uuid4
 
 import httpx
 
@@ -24,6 +25,8 @@ from splatct_client.retry import NEVER_DONE_STATUS, RETRIED_STATUS, Patience, re
 
 CHUNK = 1 << 20
 LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
+LONGEST_WAIT_S = 30.0  # of one long poll; proxies give up on a silent request after 60 s
+SHORTEST_PAUSE_S = 0.5
 OnBytes = Callable[[int], None]
 
 
@@ -31,7 +34,7 @@ class Client:
     """A connection to one server. Use it as a context manager, from one thread.
 
     Calls are repeated for `patience` while the server is away or overloaded; what must not
-    happen twice (a new upload, a new job) only if the server cannot have done it. A server that
+    happen twice (a new upload) only if the server cannot have done it. A server that
     never answered at all is reported at once.
     """
 
@@ -49,6 +52,7 @@ class Client:
         self.base_url = base_url.rstrip("/")
         self.patience = patience or Patience()
         self._reached = False
+        self._wait_s = min(LONGEST_WAIT_S, timeout_s / 2)
         self._http = httpx.Client(
             base_url=self.base_url,
             timeout=httpx.Timeout(timeout_s, connect=min(10.0, timeout_s)),
@@ -121,7 +125,12 @@ class Client:
         body: dict[str, Any] = {"scan_id": scan_id, "options": options or {}}
         if name is not None:
             body["name"] = name
-        return Job.from_json(self._json("POST", "/v1/jobs", json=body, repeatable=False))
+        try:  # under an id of our own it can be repeated until there is an answer, and there is one job
+            return Job.from_json(self._json("PUT", f"/v1/jobs/{uuid4()}", json=body))
+        except ServerProblem as problem:
+            if problem.status != 405:
+                raise
+        return Job.from_json(self._json("POST", "/v1/jobs", json=body, repeatable=False))  # an older server
 
     def job(self, job_id: str) -> Job:
         return Job.from_json(self._json("GET", f"/v1/jobs/{_id(job_id)}"))
@@ -136,19 +145,32 @@ class Client:
         return Job.from_json(self._json("POST", f"/v1/jobs/{_id(job_id)}/cancel"))
 
     def wait(self, job_id: str, on_progress: Callable[[Job], None] | None = None) -> Job:
-        """Poll until the job has finished, however it ends; slower while nothing changes."""
-        pause, seen = 0.5, None
+        """Until the job has finished, however it ends. The server is asked to answer when there is news; one too
+        old to know how answers at once, and is asked again after a pause."""
+        url, pause = f"/v1/jobs/{_id(job_id)}", SHORTEST_PAUSE_S
+        etag: str | None = None
+        seen: object = None
         while True:
-            answer = self._request("GET", f"/v1/jobs/{_id(job_id)}")
-            job = Job.from_json(_parsed(answer))
-            if on_progress:
-                on_progress(job)
-            if job.finished:
-                return job
-            state = (job.state, job.progress, job.message)
-            pause, seen = (0.5 if state != seen else min(pause * 1.5, 5.0)), state
-            asked = retry_after_s(answer.headers.get("Retry-After"))
-            self.patience.sleep(min(asked, 30.0) if asked is not None else pause)
+            asked = self.patience.clock()
+            query: dict[str, Any] = (
+                {} if etag is None else {"params": {"wait": self._wait_s}, "headers": {"If-None-Match": etag}}
+            )
+            answer = self._request("GET", url, **query)
+            news = answer.status_code != 304
+            if news:
+                job = Job.from_json(_parsed(answer))
+                if on_progress:
+                    on_progress(job)
+                if job.finished:
+                    return job
+                state = (job.state, job.progress, job.message)
+                news, seen = state != seen, state
+                etag = answer.headers.get("ETag")
+            if etag is not None and (news or self.patience.clock() - asked >= SHORTEST_PAUSE_S):
+                continue
+            pause = SHORTEST_PAUSE_S if news else min(pause * 1.5, 5.0)
+            later = retry_after_s(answer.headers.get("Retry-After"))
+            self.patience.sleep(min(later, 30.0) if later is not None else pause)
 
     # Results
 

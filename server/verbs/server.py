@@ -19,9 +19,11 @@ def run(args: argparse.Namespace) -> int:
     import logging
     import os
     import signal
+    from types import FrameType
 
     import uvicorn
 
+    from server import logs
     from server.app import create_app
     from server.settings import Settings
     from worker.lifeline import die_with_parent
@@ -32,10 +34,21 @@ def run(args: argparse.Namespace) -> int:
     settings = Settings.read(given)
     settings.require_loopback()
     os.umask(0o077)
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    logs.configure(settings.log_format)
     logging.getLogger("splatct.server").info("http://%s:%d, data in %s", settings.host, settings.port, settings.data)
-    uvicorn.run(
-        create_app(settings),
+    app = create_app(settings)
+
+    class Server(uvicorn.Server):
+        """Sends away those who wait for news before it waits for open requests to end."""
+
+        def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            service = getattr(app.state, "service", None)  # none while it still starts
+            if service is not None:
+                service.watch.close()
+            super().handle_exit(sig, frame)
+
+    config = uvicorn.Config(
+        app,
         host=settings.host,
         port=settings.port,
         log_config=None,
@@ -43,4 +56,6 @@ def run(args: argparse.Namespace) -> int:
         server_header=False,
         timeout_graceful_shutdown=5,
     )
-    return 0
+    server = Server(config)
+    server.run()
+    return 0 if server.started else 3

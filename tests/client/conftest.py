@@ -44,6 +44,7 @@ class FakeApi:
     results: dict[str, bytes] = field(default_factory=dict)
     states: list[str] = field(default_factory=lambda: ["queued", "running", "succeeded"])
     error: dict[str, str] | None = None
+    takes_ids: bool = True  # PUT /v1/jobs/{uuid}
     commit_answer: Answer | None = None
     faults: list[tuple[str, Answer | BaseException]] = field(default_factory=list)
     cut_download_at: list[int] = field(default_factory=list)
@@ -93,7 +94,9 @@ class FakeApi:
             return self.commit_answer or ok({"id": "scan-1", "name": "teapot"}, 201)
         if (method, path) == ("DELETE", "/uploads/up-1"):
             return 204, {}, b""
-        if (method, path) == ("POST", "/jobs"):
+        if method == "PUT" and path.startswith("/jobs/") and not self.takes_ids:
+            return problem(405, "Method not allowed")
+        if (method, path) == ("POST", "/jobs") or (method == "PUT" and path.startswith("/jobs/")):
             self.submitted.append(json.loads(body))
             return ok(self.job(), 202)
         if (method, path) == ("GET", "/jobs"):

@@ -16,6 +16,7 @@ from splatct_client import (
     ServerUnreachable,
     UnexpectedAnswer,
 )
+from splatct_client.retry import Patience
 from splatct_client.verbs.submit import watch
 
 JOB_ID = "6a1f6f0e-0000-4000-8000-000000000001"
@@ -71,12 +72,24 @@ def test_patience_ends(client, api, sleeps):
     assert 30 < sum(sleeps) <= 60
 
 
-def test_a_job_is_never_submitted_twice(client, api):
+def test_a_submission_is_repeated_under_the_same_id(client, api):
     client.options()
+    api.faults = [("PUT /v1/jobs", httpx.ReadTimeout("slow")), ("PUT /v1/jobs", (500, {}, b""))]
+    assert client.submit("scan-1").id == JOB_ID
+    puts = [call for call in api.calls if call.startswith("PUT")]
+    assert len(puts) == 3 and len(set(puts)) == 1 and len(api.submitted) == 1
+    client.submit("scan-1")
+    assert api.calls[-1] not in puts, "another submission, another id"
+
+
+def test_an_older_server_is_never_sent_a_job_twice(client, api):
+    client.options()
+    api.takes_ids = False
+    assert client.submit("scan-1").id == JOB_ID
     api.faults = [("POST /v1/jobs", httpx.ReadTimeout("slow"))]
     with pytest.raises(ServerUnreachable):
         client.submit("scan-1")
-    assert api.calls.count("POST /v1/jobs") == 1
+    assert api.calls.count("POST /v1/jobs") == 2
 
 
 def test_a_server_that_never_answered_is_reported_at_once(client, api, sleeps):
@@ -129,6 +142,57 @@ def test_waiting_outlives_a_restart_of_the_server(client, api):
     client.options()
     api.faults = [("GET /v1/jobs", httpx.ConnectError("refused"))] * 3
     assert client.wait(JOB_ID).state == "succeeded"
+
+
+class LongPoll:
+    """A server whose job changes when told; remembers what it was asked."""
+
+    def __init__(self, sleeps, states, tags=True, polls=True):
+        self.sleeps, self.states, self.tags, self.polls = sleeps, states, tags, polls
+        self.asked = []
+
+    def __call__(self, request):
+        query, known = dict(request.url.params), request.headers.get("If-None-Match")
+        self.asked.append((query, known))
+        assert len(self.asked) < 50
+        state = self.states[0]
+        if known is not None and self.polls:
+            self.sleeps.append(float(query["wait"]))  # the fake clock runs on what was slept
+            state = self.states.pop(0)
+        elif known is None or not self.tags:
+            state = self.states.pop(0)
+        headers = {"ETag": f'W/"{state}"'} if self.tags else {}
+        if known is not None and known == headers.get("ETag"):
+            if not self.polls:
+                self.states.pop(0)
+            return httpx.Response(304, headers=headers)
+        return httpx.Response(200, headers=headers, json={"id": JOB_ID, "state": state})
+
+
+def waited(sleeps, server):
+    seen = []
+    patience = Patience(sleep=sleeps.append, clock=lambda: sum(sleeps))
+    with Client("http://ct.example", patience=patience, transport=httpx.MockTransport(server)) as client:
+        client.wait(JOB_ID, lambda job: seen.append(job.state))
+    return seen
+
+
+def test_waiting_lets_the_server_wait(sleeps):
+    server = LongPoll(sleeps, ["queued", "queued", "queued", "running", "succeeded"])
+    assert waited(sleeps, server) == ["queued", "running", "succeeded"]
+    assert server.asked[0] == ({}, None)
+    assert all(query == {"wait": "30.0"} and known for query, known in server.asked[1:])
+    assert sleeps == [30.0] * 4, "the client itself never slept"
+
+
+def test_waiting_on_a_server_that_cannot_wait_pauses_by_itself(sleeps):
+    assert waited(sleeps, LongPoll(sleeps, ["running"] * 10 + ["succeeded"], tags=False))[-1] == "succeeded"
+    assert len(sleeps) == 10 and sleeps[0] == 0.5 and sleeps[-1] == 5.0
+
+
+def test_a_304_that_comes_too_early_is_no_reason_to_race(sleeps):
+    waited(sleeps, LongPoll(sleeps, ["running"] * 4 + ["succeeded"], polls=False))
+    assert len(sleeps) >= 3 and min(sleeps) >= 0.5
 
 
 def test_ctrl_c_leaves_the_job_alone_and_says_how_to_go_on(client, api, capsys):

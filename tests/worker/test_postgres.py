@@ -1,4 +1,4 @@
-"""The ledger on PostgreSQL: the same tests as on SQLite."""
+"""The ledger on PostgreSQL: the same tests as on SQLite, and submissions that race."""
 
 from __future__ import annotations
 
@@ -7,11 +7,17 @@ import shutil
 import socket
 import subprocess
 import tempfile
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from sqlalchemy.exc import IntegrityError
 
+from server.store import File, NewJob, Store
+from server.submissions import Claim, Kind
+from worker.contract import State
 from worker.database import Database
 from worker.ledger import Ledger
 
@@ -20,6 +26,7 @@ from .test_ledger import (  # noqa: F401  collected here once more, on the datab
     test_a_stale_attempt_is_fenced_off,
     test_cancel_is_immediate_when_queued_and_a_request_when_running,
     test_crashes_are_counted_and_end,
+    test_many_and_the_queue,
     test_of_many_claims_one_succeeds,
     test_only_finished_jobs_can_be_forgotten,
     test_pages_and_positions,
@@ -75,3 +82,29 @@ def database(url: str) -> Iterator[Database]:
 @pytest.fixture
 def ledger(database: Database) -> Ledger:
     return Ledger(database)
+
+
+@pytest.mark.parametrize("kind", list(Kind))
+def test_of_submissions_at_once_one_makes_the_job(database: Database, kind: Kind) -> None:
+    """SQLite has one writer at a time; here the transactions truly overlap."""
+    store = Store(database)
+    scan = store.commit(store.add_upload("scan", [File("scan.json", 1, None, None)]), {})
+    for turn in range(20):
+        claim, together, placed = Claim(kind, f"name-{turn}", "digest"), threading.Barrier(6), list[str]()
+
+        def submit(
+            number: int, claim: Claim = claim, together: threading.Barrier = together, placed: list[str] = placed
+        ) -> bool:
+            job_id = claim.name if kind is Kind.ID else f"{claim.name}-{number}"
+            together.wait()
+            try:
+                return store.add_job(NewJob(job_id, "job", {}, claim), scan, lambda: placed.append(job_id))
+            except IntegrityError:
+                earlier = store.submissions.find(claim)
+                assert earlier is not None and store.jobs.get(earlier.job_id) is not None
+                return False
+
+        with ThreadPoolExecutor(6) as pool:
+            assert sum(pool.map(submit, range(6))) == 1
+        assert len(placed) == 1 and len(store.jobs.in_states(State)) == turn + 1
+    store.submissions.purge()

@@ -1,0 +1,166 @@
+"""One pair of eyes for all who wait: looks at the watched jobs twice a second, in one thread for a moment,
+and wakes those whose job has changed. Hundreds who wait cost one query, and no thread of the pool.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from server.problems import ApiProblem
+from server.tail import Tail
+from worker.contract import State
+from worker.jobfolder import JobFolder
+from worker.journal import Line
+from worker.ledger import Job, Ledger
+
+log = logging.getLogger("splatct.server")
+
+EVERY_S = 0.5
+LEAST_S = 0.05  # between two looks, however many newcomers ask for one
+MOST_EYES = 500  # each is an open connection, of which a process commonly may have 1,024
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A job as it was last seen; None once it is deleted."""
+
+    job: Job | None
+    queue_position: int | None = None
+
+
+class Eye:
+    """One who waits for news of one job."""
+
+    def __init__(self, job_id: str, watched: _Watched) -> None:
+        self.job_id = job_id
+        self._watched = watched
+        self._bell = asyncio.Event()
+        if watched.sight is not None:
+            self._bell.set()
+
+    async def news(self, within_s: float | None = None) -> Sight | None:
+        """The job after its next change (the first time: as soon as it has been seen); None if there was none,
+        or if the server stops."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                await self._bell.wait()
+            self._bell.clear()
+            return self._watched.sight
+        return None
+
+    @property
+    def tail(self) -> Tail:
+        assert self._watched.tail is not None
+        return self._watched.tail
+
+    def ring(self) -> None:
+        self._bell.set()
+
+
+@dataclass
+class _Watched:
+    sight: Sight | None = None
+    tail: Tail | None = None
+    eyes: set[Eye] = field(default_factory=set)
+
+
+class Watch:
+    """Make and use it on the event loop."""
+
+    def __init__(self, ledger: Ledger, data: Path) -> None:
+        self._ledger = ledger
+        self._data = data
+        self._loop = asyncio.get_running_loop()
+        self._watched: dict[str, _Watched] = {}
+        self._newcomer = asyncio.Event()
+        self._blind = False
+        self.closed = False
+
+    @contextlib.contextmanager
+    def on(self, job_id: str, events: bool = False) -> Iterator[Eye]:
+        """Watch a job, with its events if asked. 503 when too many do already."""
+        if sum(len(watched.eyes) for watched in self._watched.values()) >= MOST_EYES:
+            raise ApiProblem(503, "busy", f"{MOST_EYES} requests wait for news already.", retry_after_s=15)
+        watched = self._watched.setdefault(job_id, _Watched())
+        if events and watched.tail is None:
+            watched.tail = Tail(JobFolder(self._data, job_id).events)
+            watched.sight = None  # what was seen so far says nothing of the events: look at both together
+        eye = Eye(job_id, watched)
+        watched.eyes.add(eye)
+        if watched.sight is None:
+            self._newcomer.set()
+        if self.closed:
+            eye.ring()
+        try:
+            yield eye
+        finally:
+            watched.eyes.discard(eye)
+            if not watched.eyes:
+                self._watched.pop(job_id, None)
+
+    def close(self) -> None:
+        """Wake all, so that a stopping server has nobody to wait for. May be called from a signal handler."""
+        self._loop.call_soon_threadsafe(self._close)
+
+    def _close(self) -> None:
+        self.closed = True
+        for watched in self._watched.values():
+            watched.sight = None
+            for eye in watched.eyes:
+                eye.ring()
+
+    async def keep_looking(self) -> None:
+        """For ever; asleep while nobody watches."""
+        while not self.closed:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(EVERY_S if self._watched else None):
+                    await self._newcomer.wait()
+            self._newcomer.clear()
+            tails = {job_id: watched.tail for job_id, watched in self._watched.items()}
+            try:
+                seen = await asyncio.to_thread(self._look, tails)
+                self._blind = False
+            except Exception:
+                if not self._blind:
+                    log.exception("looking at the watched jobs failed; trying again")
+                self._blind = True
+            else:
+                self._tell(seen, tails)
+            await asyncio.sleep(LEAST_S)
+
+    def _look(self, tails: dict[str, Tail | None]) -> dict[str, tuple[Sight, list[Line]]]:
+        """The rows before the journals: when a row says that the job has finished, all its events are there."""
+        jobs = {job.id: job for job in self._ledger.many(list(tails))}
+        queue: dict[str, int] = {}
+        if any(job.state is State.QUEUED for job in jobs.values()):
+            queue = {job_id: n for n, job_id in enumerate(self._ledger.queue(), start=1)}
+        return {
+            job_id: (Sight(jobs.get(job_id), queue.get(job_id)), [] if tail is None else tail.fetch())
+            for job_id, tail in tails.items()
+        }
+
+    def _tell(self, seen: dict[str, tuple[Sight, list[Line]]], tails: dict[str, Tail | None]) -> None:
+        for job_id, (sight, lines) in seen.items():
+            watched, tail = self._watched.get(job_id), tails[job_id]
+            if tail is not None:
+                tail.keep(lines)
+            if watched is None or self.closed or watched.tail is not tail:
+                continue  # all left meanwhile, or one came who needs the events too: the next look is theirs
+            changed = watched.sight is None or _shown(watched.sight) != _shown(sight)
+            watched.sight = sight
+            if changed or lines:
+                for eye in watched.eyes:
+                    eye.ring()
+
+
+def _shown(sight: Sight) -> object:
+    """What a change of counts as news; the heartbeat alone does not."""
+    job = sight.job
+    if job is None:
+        return None
+    return job.state, job.attempt, job.stage, job.message, job.progress, job.eta_s, sight.queue_position
