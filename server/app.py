@@ -11,7 +11,7 @@ from typing import Any
 from fastapi import FastAPI, Response
 from fastapi.staticfiles import StaticFiles
 
-from server import health, janitor, jobs, pages, problems, results, scans, uploads
+from server import health, janitor, jobs, pages, problems, results, resume, scans, uploads
 from server.dispatch import Dispatcher
 from server.guard import Guard
 from server.intake import Intake
@@ -73,7 +73,7 @@ def create_app(settings: Settings) -> FastAPI:
     )
     problems.install(app)
     app.add_middleware(Guard)
-    for part in (uploads, scans, jobs, results, health):
+    for part in (uploads, resume, scans, jobs, results, health):
         app.include_router(part.router)
     app.include_router(pages.router)
     app.mount("/static", _Static(directory=Path(__file__).parent / "static"), name="static")
