@@ -142,13 +142,14 @@ def test_names_in_other_scripts_and_requests_that_are_not_chunks(http: httpx.Cli
 
 def test_a_cut_chunk_keeps_its_bytes_only_without_a_digest(http: httpx.Client, shared: Stack) -> None:
     data = os.urandom(3 * MIB)
-    for header, kept in (((), 2 * MIB), ((f"Content-Digest: {sha256_of(data)}",), 0)):
+    for header in ((), (f"Content-Digest: {sha256_of(data)}",)):
         url = file_url(http, data)
         part = shared.data / "uploads" / url.split("/")[3] / "parts"
         connection = open_patch(shared, url, 0, len(data), data[: 2 * MIB], *header)
         shared.until(lambda at=part: sum(f.stat().st_size for f in at.iterdir()) >= MIB, what="bytes on disk")
         connection.close()
-        shared.until(lambda at=url, n=kept: offset(http, at) == n, what="what arrived counts")
+        kept = offset(http, url)
+        assert kept == 0 if header else MIB <= kept <= 2 * MIB
         assert patch(http, url, kept, data[kept:]).headers["repr-digest"] == sha256_of(data)
 
 
