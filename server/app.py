@@ -11,7 +11,7 @@ from typing import Any
 from fastapi import FastAPI, Response
 from fastapi.staticfiles import StaticFiles
 
-from server import follow, health, janitor, jobs, metrics, pages, problems, results, scans, uploads
+from server import follow, health, janitor, jobs, metrics, pages, problems, results, resume, scans, uploads
 from server.census import Census, Outcomes
 from server.dispatch import Dispatcher
 from server.guard import Guard
@@ -82,7 +82,7 @@ def create_app(settings: Settings) -> FastAPI:
     problems.install(app)
     app.add_middleware(Guard)
     app.add_middleware(Observer)
-    for part in (uploads, scans, jobs, follow, results, health, metrics):
+    for part in (uploads, resume, scans, jobs, follow, results, health, metrics):
         app.include_router(part.router)
     app.include_router(pages.router)
     app.mount("/static", _Static(directory=Path(__file__).parent / "static"), name="static")

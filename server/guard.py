@@ -59,7 +59,7 @@ class Guard:
 
 def _body_limit(scope: Scope) -> int | None:
     """Files are streamed and have the size they announced as their limit; all else is small."""
-    if scope["method"] == "PUT" and scope["path"].startswith("/v1/uploads/"):
+    if scope["method"] in ("PUT", "PATCH") and scope["path"].startswith("/v1/uploads/"):
         return None
     return 16 * MIB if scope["path"] == "/v1/uploads" else MIB
 

@@ -1,6 +1,6 @@
 """Uploaded bytes on disk: a file counts once all of it is durable under its final name.
 
-uploads/ID/parts/   files on their way, each writer with a name of its own
+uploads/ID/parts/   files on their way: each PUT with a name of its own, pieces as server.partial says
 uploads/ID/scan/    complete files; becomes scans/ID by one rename at commit
 uploads/ID/.lock    shared by writers, exclusive for a commit
 """
@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Protocol
 from uuid import uuid4
 
 from worker.jobfolder import sync_folder
@@ -31,6 +32,10 @@ class Gone(Exception):
 
 class Mismatch(Exception):
     """The bytes are not the announced ones; the text says how."""
+
+
+class Movable(Protocol):
+    def move_to(self, path: Path) -> None: ...
 
 
 class Arrival:
@@ -104,11 +109,14 @@ class Intake:
         with self._locked(upload_id, fcntl.LOCK_EX, wait_s):
             yield
 
-    def settle(self, upload_id: str, name: str, arrival: Arrival, record: Callable[[], None]) -> None:
+    def settle(self, upload_id: str, name: str, arrival: Movable, record: Callable[[], None]) -> None:
         """Give a complete file its name and record it, as one step towards other writers of that name."""
         with self._settling:
-            arrival.move_to(self._uploads / upload_id / "scan" / name)
+            arrival.move_to(self.settled(upload_id, name))
             record()
+
+    def settled(self, upload_id: str, name: str) -> Path:
+        return self._uploads / upload_id / "scan" / name
 
     def promote(self, upload_id: str) -> None:
         """Turn the files of an upload into a scan. Harmless when that has been done."""

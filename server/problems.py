@@ -6,7 +6,7 @@ Nothing of the request is echoed and no traceback leaves the process.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
 
@@ -31,13 +31,16 @@ class ApiProblem(Exception):
         detail: str,
         errors: Sequence[Problem] = (),
         retry_after_s: int | None = None,
+        headers: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(detail)
         self.status = status
         self.name = name
         self.detail = detail
         self.errors = tuple(errors)
-        self.headers = {} if retry_after_s is None else {"Retry-After": str(retry_after_s)}
+        self.headers = dict(headers or {})
+        if retry_after_s is not None:
+            self.headers["Retry-After"] = str(retry_after_s)
 
 
 def not_found(what: str) -> ApiProblem:

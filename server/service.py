@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 from uuid import UUID
 
@@ -14,6 +14,7 @@ from server.intake import Intake
 from server.problems import not_found
 from server.settings import Settings
 from server.store import Store
+from server.turns import Turns
 from server.watch import Watch
 from worker.jobfolder import JobFolder
 from worker.ledger import Job
@@ -27,6 +28,7 @@ class Service:
     watch: Watch
     outcomes: Outcomes
     wake: Callable[[], None]  # have the reconcile loop look at once
+    turns: Turns = field(default_factory=Turns)
 
     def folder(self, job_id: str) -> JobFolder:
         return JobFolder(self.settings.data, job_id)

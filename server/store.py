@@ -35,6 +35,14 @@ files = sa.Table(
     sa.Column("sha256", sa.String(64)),  # of the bytes on disk; null until complete
 )
 
+parts = sa.Table(
+    "upload_parts",
+    metadata,
+    sa.Column("upload_id", sa.String(36), sa.ForeignKey("uploads.id", ondelete="CASCADE"), primary_key=True),
+    sa.Column("name", sa.String(255), primary_key=True),
+    sa.Column("acknowledged", sa.BigInteger, nullable=False),  # that many bytes of the part are durable
+)
+
 scans = sa.Table(
     "scans",
     metadata,
@@ -45,6 +53,15 @@ scans = sa.Table(
     sa.Column("created_at", sa.Float, nullable=False, index=True),
 )
 
+_FILES_AND_PARTS = files.outerjoin(parts, sa.and_(parts.c.upload_id == files.c.upload_id, parts.c.name == files.c.name))
+_FILE = (
+    files.c.name,
+    files.c.size,
+    files.c.expected_sha256,
+    files.c.sha256,
+    sa.func.coalesce(parts.c.acknowledged, 0),
+)
+
 
 @dataclass(frozen=True)
 class File:
@@ -52,6 +69,11 @@ class File:
     size: int
     expected_sha256: str | None
     sha256: str | None
+    acknowledged: int = 0  # bytes of an incomplete file that are here
+
+    @property
+    def received(self) -> int:
+        return self.size if self.sha256 else self.acknowledged
 
 
 @dataclass(frozen=True)
@@ -113,20 +135,24 @@ class Store:
         return Upload(upload_id, name, False, now, tuple(announced))
 
     def upload(self, upload_id: str) -> Upload | None:
-        columns = (files.c.name, files.c.size, files.c.expected_sha256, files.c.sha256)
         with self.database.reading() as read:
             row = read.execute(sa.select(uploads).where(uploads.c.id == upload_id)).one_or_none()
             if row is None:
                 return None
-            query = sa.select(*columns).where(files.c.upload_id == upload_id).order_by(files.c.position)
+            query = (
+                sa.select(*_FILE)
+                .select_from(_FILES_AND_PARTS)
+                .where(files.c.upload_id == upload_id)
+                .order_by(files.c.position)
+            )
             announced = tuple(File(*file) for file in read.execute(query))
         return Upload(row.id, row.name, row.committed, row.created_at, announced)
 
     def upload_file(self, upload_id: str, name: str) -> tuple[bool, File] | None:
         """Whether the upload is committed, and one of its files."""
         query = (
-            sa.select(uploads.c.committed, files.c.name, files.c.size, files.c.expected_sha256, files.c.sha256)
-            .join_from(files, uploads)
+            sa.select(uploads.c.committed, *_FILE)
+            .select_from(_FILES_AND_PARTS.join(uploads, uploads.c.id == files.c.upload_id))
             .where(files.c.upload_id == upload_id, files.c.name == name)
         )
         with self.database.reading() as read:
@@ -137,11 +163,23 @@ class Store:
         mine = sa.and_(files.c.upload_id == upload_id, files.c.name == name)
         with self.database.writing() as write:
             write.execute(files.update().where(mine).values(sha256=sha256))
+            write.execute(parts.delete().where(parts.c.upload_id == upload_id, parts.c.name == name))
+            write.execute(uploads.update().where(uploads.c.id == upload_id).values(touched_at=time.time()))
+
+    def acknowledge(self, upload_id: str, name: str, offset: int) -> None:
+        """So many bytes of a file that arrives in pieces are durable."""
+        mine = sa.and_(parts.c.upload_id == upload_id, parts.c.name == name)
+        with self.database.writing() as write:
+            if not write.execute(parts.update().where(mine).values(acknowledged=offset)).rowcount:
+                write.execute(parts.insert().values(upload_id=upload_id, name=name, acknowledged=offset))
             write.execute(uploads.update().where(uploads.c.id == upload_id).values(touched_at=time.time()))
 
     def outstanding_bytes(self) -> int:
         """Announced by open uploads and not yet here: disk that is spoken for."""
-        query = sa.select(sa.func.coalesce(sa.func.sum(files.c.size), 0)).join_from(files, uploads)
+        still_to_come = files.c.size - sa.func.coalesce(parts.c.acknowledged, 0)
+        query = sa.select(sa.func.coalesce(sa.func.sum(still_to_come), 0)).select_from(
+            _FILES_AND_PARTS.join(uploads, uploads.c.id == files.c.upload_id)
+        )
         with self.database.reading() as read:
             return int(read.execute(query.where(~uploads.c.committed, files.c.sha256.is_(None))).scalar_one())
 
@@ -156,6 +194,7 @@ class Store:
         with self.database.writing() as write:
             if write.execute(uploads.select().where(is_open)).first() is None:
                 return False
+            write.execute(parts.delete().where(parts.c.upload_id == upload_id))
             write.execute(files.delete().where(files.c.upload_id == upload_id))
             write.execute(uploads.delete().where(is_open))
             return True
@@ -185,6 +224,7 @@ class Store:
             if self.jobs.needs_scan(write, scan_id):
                 return False
             write.execute(scans.delete().where(scans.c.id == scan_id))
+            write.execute(parts.delete().where(parts.c.upload_id == scan_id))
             write.execute(files.delete().where(files.c.upload_id == scan_id))
             write.execute(uploads.delete().where(uploads.c.id == scan_id))
             return True

@@ -16,6 +16,7 @@ from starlette.requests import ClientDisconnect
 from server import names
 from server.checking import CheckFailed, check_scan
 from server.intake import Arrival, Busy, Gone, Mismatch
+from server.partial import remove_part
 from server.problems import ApiProblem, invalid, not_found
 from server.scans import scan_out
 from server.schema import FileIn, FileOut, ScanOut, UploadIn, UploadOut, moment
@@ -157,7 +158,9 @@ async def _receive(request: Request, service: Service, upload_id: str, file: Fil
         def record() -> None:
             service.store.received(upload_id, file.name, sha256)
 
-        await to_thread.run_sync(service.intake.settle, upload_id, file.name, arrival, record)
+        async with service.turns.take(upload_id, file.name):  # the whole file replaces what came in pieces
+            await to_thread.run_sync(service.intake.settle, upload_id, file.name, arrival, record)
+            await to_thread.run_sync(remove_part, parts, file.name)
         return sha256
     finally:
         await to_thread.run_sync(arrival.discard, abandon_on_cancel=False)
@@ -198,7 +201,7 @@ def _upload_out(upload: Upload) -> UploadOut:
     links = {"self": base}
     links |= {"scan": f"/v1/scans/{upload.id}"} if upload.committed else {"commit": f"{base}/commit"}
     files = [
-        FileOut(name=f.name, size=f.size, received=f.size if f.sha256 else 0, complete=bool(f.sha256), sha256=f.sha256)
+        FileOut(name=f.name, size=f.size, received=f.received, complete=bool(f.sha256), sha256=f.sha256)
         for f in upload.files
     ]
     return UploadOut(

@@ -21,6 +21,8 @@ from splatct_client.errors import (
     UnexpectedAnswer,
 )
 from splatct_client.models import FileSpec, Job, ResultFile, Scan, Upload, UploadedFile
+from splatct_client.resume import CHUNK as RESUMED_FROM
+from splatct_client.resume import send_in_chunks
 from splatct_client.retry import NEVER_DONE_STATUS, RETRIED_STATUS, Patience, retry_after_s
 
 CHUNK = 1 << 20
@@ -81,9 +83,14 @@ class Client:
     ) -> UploadedFile:
         """Send one file, streamed and hashed on the way. `on_bytes` is told the bytes of this file sent so far.
 
+        A large one goes in chunks, and after a failure on from where the server stands.
+
         Raises IntegrityError if the server's sha256 differs from what was read here.
         """
         size = len(source) if isinstance(source, bytes) else source.stat().st_size
+        url = f"/v1/uploads/{_id(upload_id)}/files/{_name(name)}"
+        if isinstance(source, Path) and size > RESUMED_FROM:
+            return UploadedFile(name, size, size, True, send_in_chunks(self, url, source, on_bytes))
         digest = hashlib.sha256()
 
         def body() -> Iterator[bytes]:
@@ -96,7 +103,6 @@ class Client:
                 if on_bytes:
                     on_bytes(sent)
 
-        url = f"/v1/uploads/{_id(upload_id)}/files/{_name(name)}"
         try:
             stored = UploadedFile.from_json(self._json("PUT", url, content=body, size=size))
         except httpx.LocalProtocolError as error:
@@ -189,6 +195,16 @@ class Client:
 
     # The wire
 
+    def offset(self, url: str) -> httpx.Response:
+        """HEAD of a file of an upload: `Upload-Offset` is where to go on."""
+        return self._request("HEAD", url)
+
+    def send_chunk(
+        self, url: str, headers: dict[str, str], body: Callable[[], Iterator[bytes]], size: int
+    ) -> httpx.Response:
+        """One PATCH. Repeated only if the server cannot have taken any of it: see `resume`."""
+        return self._request("PATCH", url, repeatable=False, content=body, size=size, headers=headers)
+
     def stream(self, url: str, headers: dict[str, str]) -> httpx.Response:
         """A GET whose body has not been read yet; the caller closes it. Not repeated: see `download`."""
         response = self._http.send(
@@ -217,9 +233,11 @@ class Client:
         if timeout is not None:
             kwargs["timeout"] = timeout
         attempts = self.patience.start()
+        if content is not None:
+            kwargs["headers"] = {**kwargs.get("headers", {}), "Content-Length": str(size)}
         while True:
             if content is not None:
-                kwargs |= {"content": content(), "headers": {"Content-Length": str(size)}}
+                kwargs["content"] = content()
             try:
                 response = self._http.request(method, url, **kwargs)
             except httpx.LocalProtocolError:
