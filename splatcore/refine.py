@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from splatcore.descent import Descent, Rates
-from splatcore.geometry import Frames
+from splatcore.geometry import Array, Frames
 from splatcore.pyramid import Level
 from splatcore.splats import Floats
 from splatcore.trial import Indices
@@ -24,6 +24,7 @@ from splatcore.variation import Variation
 WEIGHTS = (0.0, 0.02, 0.05)  # of the total variation beside the mean loss; each is tried if the one before won
 _UNSEEN_WEIGHT = 0.02  # where no view can be left out: so few views need a prior
 _FORGET, _TRIAL_STEPS, _RESTING = 900, 400, 600
+_SURE = 3.0  # standard errors of the mean difference, over the views left out, by which a weight must win
 _EVERY = 2  # steps of Adam to one of the variation, which is twice as strong then
 _REST = 0.15  # rates at the end of the stage before, of those at its beginning
 _HIGH = 0.9  # to which they rise again
@@ -93,15 +94,22 @@ def weigh(descent: Descent, here: Level, frames: Frames, held: Indices, seed: in
     forgetful = descent.branch(_FORGET, MOVING, corner)
     yield from Refinement(forgetful, here, kept, 0.0, rng).run(frames, _FORGET)
     found: list[tuple[float, float]] = []
+    best, least = 0.0, np.zeros(0)
     for weight in WEIGHTS:
         branch = forgetful.branch(_TRIAL_STEPS, MOVING.times(_REST), corner)
         yield from Refinement(branch, here, kept, weight, np.random.default_rng(seed)).run(frames, _TRIAL_STEPS)
-        unseen = np.mean([r @ r / r.size for r in _residuals(branch, here, frames, held)])
-        found.append((weight, float(np.sqrt(unseen))))
-        if len(found) > 1 and found[-1][1] >= found[-2][1]:
+        unseen = np.array([r @ r / r.size for r in _residuals(branch, here, frames, held)])
+        found.append((weight, float(np.sqrt(unseen.mean()))))
+        if len(found) > 1 and not _clearly_less(unseen, least):
             break
-    best = min(found, key=lambda pair: pair[1])[0]
+        best, least = weight, unseen
     return Weighing(best, forgetful if best else descent, tuple(found), len(held))
+
+
+def _clearly_less(one: Array, other: Array) -> bool:
+    """Whether `one` is less than `other` in the mean over views by more than chance."""
+    gain = other - one
+    return float(gain.mean()) > _SURE * float(gain.std(ddof=1)) / float(np.sqrt(len(gain)))
 
 
 def refine(

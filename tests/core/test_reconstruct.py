@@ -47,6 +47,7 @@ def test_poses_are_found(perturbed, tmp_path):
     assert found["psnr_aligned"] > found["psnr"]
 
 
+@pytest.mark.slow
 def test_calibration_is_nearly_as_good_as_knowing_the_poses(perturbed, tmp_path):
     folder, scan, result = perturbed
     found = scores(result, folder, tmp_path)
@@ -64,6 +65,7 @@ def scan_with_frames(scan: Scan, frames: list[dict]) -> Scan:
     return replace(scan, frames=replace(scan.frames, **given))
 
 
+@pytest.mark.slow
 def test_good_poses_are_left_alone(tmp_path):
     scan = scan_of(tmp_path / "scan", Simulation(views=40, det=64, seed=1), edge=32)
     fixed = scores(drain(reconstruct(scan, Options(calibrate="none", threads=1))), tmp_path / "scan", tmp_path)

@@ -83,6 +83,7 @@ def test_the_choice_is_the_better_volume(sharp_result, monkeypatch):
     assert psnr(chosen.volume, truth, 0.01) > psnr(plain.volume, truth, 0.01) + 0.5
 
 
+@pytest.mark.slow
 def test_the_last_stage_moves_no_view(tmp_path):
     simulate(sharp(), tmp_path, replace(NOISY, views=16), threads=1, name="object")
     events = list(reconstruct(read_scan(tmp_path), replace(FIXED, calibrate="full")))
