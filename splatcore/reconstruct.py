@@ -177,7 +177,6 @@ class _Run:
         self._deviation = 0.0  # robust residual, line-integral units, from the last sweep
         self._works: dict[int, _Work] = {}
         self._refining = _Work(0, 0)
-        self._held = np.zeros(0, np.int64)  # views that splats of the finest level do not see before the last stage
         self._done = 0.0
         self._fraction = 0.0
 
@@ -190,7 +189,6 @@ class _Run:
             self._works[factor] = _Work(steps, splats)
         if self._options.quality != "preview":
             self._refining = _Work(int(min(_REFINING, most) * quality), self._works[scales[-1]].splats)
-            self._held = held_out_views(len(self._scan.frames))
 
     def progress(self, stage: str, message: str, **facts: object) -> Progress:
         return Progress(stage, self._fraction, message, time.monotonic() - self._began, **facts)  # type: ignore[arg-type]
@@ -225,13 +223,12 @@ class _Run:
         yield self.progress(
             "level", f"binning {here.factor}: {len(splats)} splats", level=here.factor, splats=len(splats)
         )
-        drawn = np.setdiff1d(np.arange(len(frames)), [])
-        views, cone, loss = len(drawn), frames.beam == "cone", 0.0
+        views, cone, loss = len(frames), frames.beam == "cone", 0.0
         first_sweep = min(2 * views, int(_SETTLE_IN * work.steps))
         packed = frames.packed()
         order: list[int] = []
         for step in range(1, work.steps + 1):
-            order = order or list(self._rng.permutation(drawn))
+            order = order or list(self._rng.permutation(views))
             view = order.pop()
             loss += descent.step(packed[view], cone, here.images[view], here.mask)
             if order and step < work.steps:
@@ -267,7 +264,7 @@ class _Run:
         assert self._descent is not None
         began, work, here = time.monotonic(), self._refining, self._steady(here)
         frames = self._corrected(here.nominal)
-        trial = weigh(self._descent, here, frames, self._held, self._options.seed)
+        trial = weigh(self._descent, here, frames, held_out_views(len(frames)), self._options.seed)
         while self._weighing is None:
             try:
                 loss = next(trial)

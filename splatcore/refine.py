@@ -3,7 +3,7 @@
 While poses move, the splats must follow the images and nothing else: a prior on the volume would bend the poses to
 it. Once they rest, the rates rise again and two things change. The loss becomes quadratic within the noise, which
 averages noise better than L1 does. And the volume may be asked for little total variation: an object of few sharp
-materials gains decibels by it, a smooth one loses. Views that took no part so far say which it is.
+materials gains decibels by it, a smooth one loses. Views left out for a while say which it is.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ _REST = 0.15  # rates at the end of the stage before, of those at its beginning
 _HIGH = 0.9  # to which they rise again
 _CORNER = 1.345  # standard deviations: Huber's corner that is 95 % efficient on normal noise (Huber 1964)
 
-
 MOVING = Rates(end=_REST)  # of the stage before
 
 
@@ -49,7 +48,7 @@ class Weighing:
             text = f"Total variation counted with weight {self.weight:g}; no view could be left out to choose it."
         else:
             plain, best = self.residuals[0][1], dict(self.residuals)[self.weight]
-            gain = f"{1 - best / plain:.2%} better than without" if self.weight else "best without it"
+            gain = f"{1 - best / plain:.2%} better than without" if self.weight else "not clearly better with more"
             text = f"Total variation counted with weight {self.weight:g}: views left out were predicted {gain}."
         evidence = {f"residual_at_{weight:g}": rms for weight, rms in self.residuals}
         return {
@@ -59,7 +58,7 @@ class Weighing:
 
 
 class Refinement:
-    """Adam on the volume alone, whatever the frames are at the moment."""
+    """Adam on the volume alone."""
 
     def __init__(self, descent: Descent, here: Level, views: Indices, weight: float, rng: np.random.Generator) -> None:
         """descent: whose splats are moved; views: indices of those to draw."""
