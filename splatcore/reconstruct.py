@@ -54,7 +54,7 @@ from splatcore.uncertainty import pose_covariance
 
 # Adam steps at each binning factor. Coarse steps cost a hundredth of fine ones.
 _STEPS = {8: 600, 4: 750, 2: 1200, 1: 2000}
-_REFINING = 3000  # of the last stage, poses at rest
+_REFINING, _REFINING_EPOCHS = 6000, 100  # at most, of the last stage, poses at rest
 _MOST_EPOCHS = 200
 _QUALITY = {"preview": 1.0, "normal": 1.0, "fine": 1.5}
 _FINEST = {"preview": 2, "normal": 1, "fine": 1}
@@ -188,7 +188,8 @@ class _Run:
             splats = max(min(1_500, self._most_splats), int(self._most_splats / factor**1.5))
             self._works[factor] = _Work(steps, splats)
         if self._options.quality != "preview":
-            self._refining = _Work(int(min(_REFINING, most) * quality), self._works[scales[-1]].splats)
+            steps = min(_REFINING, _REFINING_EPOCHS * len(self._scan.frames))
+            self._refining = _Work(int(steps * quality), self._works[scales[-1]].splats)
 
     def progress(self, stage: str, message: str, **facts: object) -> Progress:
         return Progress(stage, self._fraction, message, time.monotonic() - self._began, **facts)  # type: ignore[arg-type]

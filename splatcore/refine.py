@@ -24,6 +24,7 @@ from splatcore.variation import Variation
 WEIGHTS = (0.0, 0.02, 0.05)  # of the total variation beside the mean loss; each is tried if the one before won
 _UNSEEN_WEIGHT = 0.02  # where no view can be left out: so few views need a prior
 _FORGET, _TRIAL_STEPS, _RESTING = 900, 400, 600
+_PLAIN = 0.5  # of the stage's steps, where the images hold enough to go on without a prior: more follow the noise
 _SURE = 3.0  # standard errors of the mean difference, over the views left out, by which a weight must win
 _EVERY = 2  # steps of Adam to one of the variation, which is twice as strong then
 _REST = 0.15  # rates at the end of the stage before, of those at its beginning
@@ -39,6 +40,7 @@ class Weighing:
 
     weight: float
     start: Descent = field(repr=False)
+    further: bool = True  # whether to go on at high rates, or to come to rest
     residuals: tuple[tuple[float, float], ...] = ()  # weight, rms residual of the views left out
     views: int = 0  # left out
 
@@ -50,10 +52,12 @@ class Weighing:
             plain, best = self.residuals[0][1], dict(self.residuals)[self.weight]
             gain = f"{1 - best / plain:.2%} better than without" if self.weight else "not clearly better with more"
             text = f"Total variation counted with weight {self.weight:g}: views left out were predicted {gain}."
+            if not self.further:
+                text += " Going on without it would have followed the noise, so the volume came to rest early."
         evidence = {f"residual_at_{weight:g}": rms for weight, rms in self.residuals}
         return {
             "name": "smoothness of the volume", "severity": "ok", "text": text,
-            "evidence": {"weight": self.weight, "held_out_views": self.views, **evidence},
+            "evidence": {"weight": self.weight, "held_out_views": self.views, "further": self.further, **evidence},
         }  # fmt: skip
 
 
@@ -85,24 +89,36 @@ def weigh(descent: Descent, here: Level, frames: Frames, held: Indices, seed: in
     """The weight of the variation that best predicts views (indices) left out. Yields losses.
 
     First the splats forget those views: rates rise, the other views are drawn. Then short branches, one for each
-    weight, come to rest."""
+    weight, come to rest. Where no weight helps, another branch first forgets for as long again: does going on help?"""
     if not len(held):
         return Weighing(_UNSEEN_WEIGHT, descent)
     kept = np.setdiff1d(np.arange(len(frames)), held)
-    corner, rng = _noise(descent, here, frames), np.random.default_rng(seed)
-    forgetful = descent.branch(_FORGET, MOVING, corner)
-    yield from Refinement(forgetful, here, kept, 0.0, rng).run(frames, _FORGET)
+    corner = _noise(descent, here, frames)
+
+    def unseen(start: Descent, weight: float) -> Generator[float, None, Array]:
+        """Mean squared residuals of the views left out, once the splats have come to rest."""
+        branch = start.branch(_TRIAL_STEPS, MOVING.times(_REST), corner)
+        yield from Refinement(branch, here, kept, weight, np.random.default_rng(seed)).run(frames, _TRIAL_STEPS)
+        return np.array([r @ r / r.size for r in _residuals(branch, here, frames, held)])
+
+    def forget(start: Descent, seed: int) -> Generator[float, None, Descent]:
+        branch = start.branch(_FORGET, MOVING, corner)
+        yield from Refinement(branch, here, kept, 0.0, np.random.default_rng(seed)).run(frames, _FORGET)
+        return branch
+
+    forgetful = yield from forget(descent, seed)
     found: list[tuple[float, float]] = []
     best, least = 0.0, np.zeros(0)
     for weight in WEIGHTS:
-        branch = forgetful.branch(_TRIAL_STEPS, MOVING.times(_REST), corner)
-        yield from Refinement(branch, here, kept, weight, np.random.default_rng(seed)).run(frames, _TRIAL_STEPS)
-        unseen = np.array([r @ r / r.size for r in _residuals(branch, here, frames, held)])
-        found.append((weight, float(np.sqrt(unseen.mean()))))
-        if len(found) > 1 and not _clearly_less(unseen, least):
+        missed = yield from unseen(forgetful, weight)
+        found.append((weight, float(np.sqrt(missed.mean()))))
+        if len(found) > 1 and not _clearly_less(missed, least):
             break
-        best, least = weight, unseen
-    return Weighing(best, forgetful if best else descent, tuple(found), len(held))
+        best, least = weight, missed
+    if best:
+        return Weighing(best, forgetful, True, tuple(found), len(held))
+    later = yield from unseen((yield from forget(forgetful, seed + 1)), 0.0)
+    return Weighing(best, descent, _clearly_less(later, least), tuple(found), len(held))
 
 
 def _clearly_less(one: Array, other: Array) -> bool:
@@ -116,9 +132,10 @@ def refine(
 ) -> tuple[Refinement, int]:
     """The refinement with all views, yet to be run, and its number of steps: `steps` at most."""
     rates = Rates().times(_HIGH)
-    if not weighing.weight:
-        # What no prior holds would follow the noise if it went on: it comes to rest from where it is.
+    if not weighing.further:
         rates, steps = MOVING.times(_REST), min(steps, _RESTING)
+    elif not weighing.weight:
+        steps = int(_PLAIN * steps)
     branch = weighing.start.branch(steps, rates, _noise(weighing.start, here, frames))
     return Refinement(branch, here, np.arange(len(frames)), weighing.weight, rng), steps
 

@@ -105,7 +105,7 @@ def test_a_preview_does_without(tmp_path):
 def test_too_few_views_to_hold_any_out_get_some(tmp_path):
     simulate(sharp(), tmp_path, replace(NOISY, views=12), threads=1, name="few")
     evidence = weighing(drain(reconstruct(read_scan(tmp_path), FIXED)))
-    assert evidence == {"weight": 0.02, "held_out_views": 0}
+    assert evidence == {"weight": 0.02, "held_out_views": 0, "further": True}
     assert 0.02 in WEIGHTS
 
 
@@ -140,9 +140,18 @@ def test_a_branch_keeps_its_momentum(tmp_path):
     np.testing.assert_array_equal(branch.splats.means, trunk.splats.means)
 
 
-def test_without_variation_it_soon_comes_to_rest(tmp_path):
+def test_where_the_images_hold_no_more_it_soon_comes_to_rest(tmp_path):
     scan = scan_of(sharp(), tmp_path)
     here, trunk = level(scan, 1), descent_of(scan)
     rng = np.random.default_rng(0)
-    assert refine(Weighing(0.0, trunk), here, here.nominal, 3000, rng)[1] == 600
-    assert refine(Weighing(0.02, trunk), here, here.nominal, 3000, rng)[1] == 3000
+    for weight, further, steps in ((0.0, False, 600), (0.0, True, 1500), (0.02, True, 3000)):
+        assert refine(Weighing(weight, trunk, further), here, here.nominal, 3000, rng)[1] == steps
+
+
+@pytest.mark.parametrize(("noise", "further"), [("none", True), ("r2", False)])
+def test_views_left_out_say_whether_going_on_helps(tmp_path, monkeypatch, noise, further):
+    """Without noise there is nothing wrong to be followed; in few splats' worth of noisy pixels there is."""
+    monkeypatch.setattr("splatcore.refine.WEIGHTS", (0.0,))
+    simulate(sharp(), tmp_path, replace(NOISY, noise=noise, views=60), threads=1, name="object")
+    evidence = weighing(drain(reconstruct(read_scan(tmp_path), FIXED)))
+    assert evidence["weight"] == 0 and evidence["further"] is further
