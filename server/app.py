@@ -17,6 +17,7 @@ from server.dispatch import Dispatcher
 from server.guard import Guard
 from server.intake import Intake
 from server.metrics import JobNumbers, Metrics
+from server.migrations import prepare
 from server.observe import Observer
 from server.reconcile import Reconciler, keep_reconciling
 from server.service import Service
@@ -43,7 +44,7 @@ def create_app(settings: Settings) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         (settings.data / "jobs").mkdir(parents=True, exist_ok=True)
         database = Database(settings.database)
-        database.create_tables()
+        prepare(database)
         store, intake = Store(database), Intake(settings.data)
         dispatcher = Dispatcher(settings.redis_url)
         watch = Watch(store.jobs, settings.data)

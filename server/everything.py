@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from server.children import Child, stop_all
+from server.opening import make_ready
 from server.redisserver import OwnRedis, RedisUnavailable
 from server.settings import Settings, SettingsError
 
@@ -31,9 +32,7 @@ def run_everything(settings: Settings, workers: int, has_redis: bool, ready: Cal
     stop = threading.Event()
     for which in (signal.SIGINT, signal.SIGTERM):
         signal.signal(which, lambda *_: stop.set())
-    if settings.data.exists() and not settings.data.is_dir():
-        raise SettingsError(f"data: {settings.data} is a file, expected a folder; choose another with --data")
-    settings.data.mkdir(parents=True, exist_ok=True)
+    make_ready(settings)
     with _only_one(settings.data), contextlib.ExitStack() as cleanup:
         redis = None
         if not has_redis:

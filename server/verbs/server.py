@@ -25,6 +25,7 @@ def run(args: argparse.Namespace) -> int:
 
     from server import logs
     from server.app import create_app
+    from server.opening import make_ready
     from server.settings import Settings
     from worker.lifeline import die_with_parent
 
@@ -35,6 +36,7 @@ def run(args: argparse.Namespace) -> int:
     settings.require_loopback()
     os.umask(0o077)
     logs.configure(settings.log_format)
+    make_ready(settings)
     logging.getLogger("splatct.server").info("http://%s:%d, data in %s", settings.host, settings.port, settings.data)
     app = create_app(settings)
 
