@@ -25,7 +25,6 @@ STOP_S = 15.0
 
 def run_everything(settings: Settings, workers: int, has_redis: bool, ready: Callable[[str], None]) -> int:
     """Run until SIGINT or SIGTERM. `ready` is called once, with the URL, when the server answers."""
-    settings.require_loopback()
     if workers < 1:
         raise SettingsError(f"workers: got {workers}, expected 1 or more")
     settings = settings.model_copy(update={"port": _free_port(settings.host, settings.port)})

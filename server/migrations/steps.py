@@ -6,6 +6,6 @@ from collections.abc import Callable
 
 import sqlalchemy as sa
 
-from server.migrations import v0001_first
+from server.migrations import v0001_first, v0002_tenants
 
-STEPS: tuple[Callable[[sa.Connection], None], ...] = (v0001_first.upgrade,)
+STEPS: tuple[Callable[[sa.Connection], None], ...] = (v0001_first.upgrade, v0002_tenants.upgrade)
