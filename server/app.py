@@ -12,11 +12,14 @@ from fastapi import FastAPI, Response
 from fastapi.staticfiles import StaticFiles
 
 from server import follow, health, janitor, jobs, metrics, pages, problems, results, resume, scans, uploads
+from server.access import Access
 from server.census import Census, Outcomes
 from server.dispatch import Dispatcher
 from server.guard import Guard
 from server.intake import Intake
+from server.keys import KeyRing
 from server.metrics import JobNumbers, Metrics
+from server.migrations import prepare
 from server.observe import Observer
 from server.reconcile import Reconciler, keep_reconciling
 from server.service import Service
@@ -43,7 +46,7 @@ def create_app(settings: Settings) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         (settings.data / "jobs").mkdir(parents=True, exist_ok=True)
         database = Database(settings.database)
-        database.create_tables()
+        prepare(database)
         store, intake = Store(database), Intake(settings.data)
         dispatcher = Dispatcher(settings.redis_url)
         watch = Watch(store.jobs, settings.data)
@@ -57,6 +60,7 @@ def create_app(settings: Settings) -> FastAPI:
         app.state.service = Service(settings, store, intake, watch, outcomes, wake_up)
         app.state.metrics = Metrics(JobNumbers(Census(database), outcomes, reconciler, settings.data))
         app.state.dispatcher = dispatcher
+        app.state.keys = KeyRing(database)
         tasks = [
             asyncio.create_task(keep_reconciling(reconciler, settings.reconcile_s, wake)),
             asyncio.create_task(watch.keep_looking()),
@@ -80,7 +84,8 @@ def create_app(settings: Settings) -> FastAPI:
         separate_input_output_schemas=False,
     )
     problems.install(app)
-    app.add_middleware(Guard)
+    app.add_middleware(Access, open_without_keys=settings.only_loopback_reaches_us)
+    app.add_middleware(Guard, allowed_hosts=settings.host_names)
     app.add_middleware(Observer)
     for part in (uploads, resume, scans, jobs, follow, results, health, metrics):
         app.include_router(part.router)

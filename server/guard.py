@@ -1,8 +1,8 @@
 """Stands before every route: body limits, host and origin checks, security headers.
 
-There are no keys yet, so the one thing between a web page on the internet and this API is the
-browser. Names other than loopback ones are refused (DNS rebinding), and so are writes that a browser
-marks as coming from another site.
+Where there are no keys, the one thing between a web page on the internet and this API is the browser; where
+there are, a browser may hold a session. So names that are not ours are refused (DNS rebinding), and so are
+writes that a browser marks as coming from another site.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ _HEADERS = {
 
 
 class Guard:
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, allowed_hosts: frozenset[str]) -> None:
         self.app = app
+        self._allowed_hosts = allowed_hosts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -42,8 +43,10 @@ class Guard:
                     MutableHeaders(scope=message).setdefault(name, value)
             await send(message)
 
-        if not _is_local(headers.get("host", "")):
-            refusal = response(421, "misdirected-request", "This server answers to its loopback name only.")
+        if not self._is_ours(headers.get("host", "")):
+            refusal = response(
+                421, "misdirected-request", "This server does not go by that name; SPLATCT_ALLOWED_HOSTS lists its own."
+            )
         elif scope["method"] not in ("GET", "HEAD", "OPTIONS") and headers.get("sec-fetch-site") in (
             "cross-site",
             "same-site",
@@ -55,6 +58,17 @@ class Guard:
             await self.app(scope, receive if limit is None else _limited(receive, limit), send_guarded)
             return
         await refusal(scope, receive, send_guarded)
+
+    def _is_ours(self, host: str) -> bool:
+        """Whether a Host header names this machine: by a loopback name, or one that the settings allow."""
+        name, colon, port = host.rpartition(":")
+        name = (name if colon and port.isdecimal() else host).strip("[]").lower()
+        if name in self._allowed_hosts:
+            return True
+        try:
+            return name == "localhost" or ipaddress.ip_address(name).is_loopback
+        except ValueError:
+            return False
 
 
 def _body_limit(scope: Scope) -> int | None:
@@ -81,13 +95,3 @@ def _limited(receive: Receive, limit: int) -> Receive:
         return message
 
     return counted
-
-
-def _is_local(host: str) -> bool:
-    """Whether a Host header names this machine by a loopback name."""
-    name, colon, port = host.rpartition(":")
-    name = (name if colon and port.isdecimal() else host).strip("[]").lower()
-    try:
-        return name == "localhost" or ipaddress.ip_address(name).is_loopback
-    except ValueError:
-        return False

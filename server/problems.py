@@ -65,9 +65,13 @@ def response(
     return JSONResponse(body, status, headers, media_type="application/problem+json")
 
 
+def answer(problem: ApiProblem) -> JSONResponse:
+    return response(problem.status, problem.name, problem.detail, problem.errors, problem.headers)
+
+
 async def _on_problem(_request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, ApiProblem)
-    return response(error.status, error.name, error.detail, error.errors, error.headers)
+    return answer(error)
 
 
 async def _on_http(_request: Request, error: Exception) -> JSONResponse:

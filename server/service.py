@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 from uuid import UUID
 
 from fastapi import Depends, Request
 
+from server.access import Caller
 from server.census import Outcomes
 from server.intake import Intake
 from server.problems import not_found
@@ -29,6 +30,11 @@ class Service:
     outcomes: Outcomes
     wake: Callable[[], None]  # have the reconcile loop look at once
     turns: Turns = field(default_factory=Turns)
+    caller: Caller | None = None  # None: the server itself
+
+    def serving(self, caller: Caller) -> Service:
+        """The same for one caller: its store finds nothing that is another tenant's."""
+        return replace(self, store=self.store.of(caller.tenant), caller=caller)
 
     def folder(self, job_id: str) -> JobFolder:
         return JobFolder(self.settings.data, job_id)
@@ -41,9 +47,9 @@ class Service:
         return job
 
 
-def _service(request: Request) -> Service:
+def _serving(request: Request) -> Service:
     service: Service = request.app.state.service
-    return service
+    return service.serving(request.state.caller)
 
 
-Served = Annotated[Service, Depends(_service)]
+Served = Annotated[Service, Depends(_serving)]

@@ -8,7 +8,7 @@ from uuid import UUID, uuid4
 
 from sqlalchemy.exc import IntegrityError
 
-from server.problems import ApiProblem, invalid
+from server.problems import ApiProblem, invalid, not_found
 from server.schema import JobIn
 from server.service import Service
 from server.store import NewJob, Scan
@@ -66,8 +66,8 @@ def _queue(service: Service, scan: Scan, job: NewJob) -> None:
 
 def _lost_race(service: Service, claim: Claim) -> Job:
     earlier = service.store.submissions.find(claim)
-    if earlier is None:  # its id is that of a job which was submitted without one
-        raise _other(claim)
+    if earlier is None:  # its id is that of a job which was submitted without one, or by another tenant
+        raise _other(claim) if service.store.jobs.get(claim.name) else not_found("job")
     return _repeated(service, claim, earlier)
 
 

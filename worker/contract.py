@@ -10,6 +10,7 @@ from enum import IntEnum, StrEnum
 
 QUEUE = "splatct"
 TASK = "worker.supervise.run_job"
+LOCAL_TENANT = "local"  # whose everything is as long as there are no keys
 
 MAX_CRASHES = 3  # attempts that may die before the job is given up; hand-backs do not count
 HEARTBEAT_S = 2.0  # how often a supervisor marks its row

@@ -14,7 +14,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from worker.contract import ACTIVE, FINISHED, MAX_CRASHES, TRANSITIONS, ErrorKind, State
+from worker.contract import ACTIVE, FINISHED, LOCAL_TENANT, MAX_CRASHES, TRANSITIONS, ErrorKind, State
 from worker.database import Database, metadata
 
 _STATE = sa.Enum(State, native_enum=False, length=16, values_callable=lambda states: [s.value for s in states])
@@ -41,6 +41,8 @@ jobs = sa.Table(
     sa.Column("created_at", sa.Float, nullable=False, index=True),  # seconds since 1970, UTC
     sa.Column("started_at", sa.Float),
     sa.Column("finished_at", sa.Float),
+    sa.Column("tenant", sa.String(64), nullable=False, server_default=LOCAL_TENANT),
+    sa.Index("ix_jobs_tenant_created_at", "tenant", "created_at"),
 )
 
 
@@ -67,27 +69,34 @@ class Job:
     created_at: float
     started_at: float | None
     finished_at: float | None
+    tenant: str
 
 
 class Ledger:
-    """Reads and changes jobs. Methods that change one return whether the change took place."""
+    """Reads and changes jobs. Methods that change one return whether the change took place.
 
-    def __init__(self, database: Database) -> None:
+    With a `tenant` it knows that one's jobs and no others; without, as workers and the server's own loops
+    use it, all.
+    """
+
+    def __init__(self, database: Database, tenant: str | None = None) -> None:
         self._database = database
+        self._tenant = tenant
 
     def add(self, write: sa.Connection, job_id: str, name: str, scan: tuple[str, str], options: dict[str, Any]) -> None:
         """Insert a queued job within the caller's transaction. `scan` is (id, name)."""
         row = {"id": job_id, "name": name, "scan_id": scan[0], "scan_name": scan[1], "options": options}
+        row["tenant"] = self._tenant or LOCAL_TENANT
         write.execute(jobs.insert().values(**row, state=State.QUEUED, message="Waiting", created_at=time.time()))
 
     def get(self, job_id: str) -> Job | None:
         with self._database.reading() as read:
-            row = read.execute(sa.select(jobs).where(jobs.c.id == job_id)).one_or_none()
+            row = read.execute(sa.select(jobs).where(jobs.c.id == job_id, self._mine())).one_or_none()
         return None if row is None else _job(row)
 
     def page(self, state: State | None, limit: int, before: Job | None) -> list[Job]:
         """Jobs, newest first, older than `before`."""
-        query = sa.select(jobs).order_by(jobs.c.created_at.desc(), jobs.c.id.desc()).limit(limit)
+        query = sa.select(jobs).where(self._mine()).order_by(jobs.c.created_at.desc(), jobs.c.id.desc()).limit(limit)
         if state is not None:
             query = query.where(jobs.c.state == state)
         if before is not None:
@@ -106,15 +115,16 @@ class Ledger:
         with self._database.reading() as read:
             return [_job(row) for row in read.execute(sa.select(jobs).where(jobs.c.id.in_(ids)))]
 
-    def queue(self) -> list[str]:
-        """The ids of the queued jobs in the order of `position`."""
-        query = sa.select(jobs.c.id).where(jobs.c.state == State.QUEUED).order_by(jobs.c.created_at, jobs.c.id)
+    def positions(self) -> dict[str, int]:
+        """The `position` of every queued job."""
+        place = sa.func.row_number().over(partition_by=jobs.c.tenant, order_by=[jobs.c.created_at, jobs.c.id])
         with self._database.reading() as read:
-            return list(read.execute(query).scalars())
+            query = sa.select(jobs.c.id, place).where(jobs.c.state == State.QUEUED)
+            return {job_id: int(number) for job_id, number in read.execute(query)}
 
     def position(self, job: Job) -> int:
-        """1 for the queued job that is next."""
-        ahead = sa.tuple_(jobs.c.created_at, jobs.c.id) < (job.created_at, job.id)
+        """1 for the queued job that is the next of its tenant's: how many others wait is theirs to know."""
+        ahead = sa.and_(jobs.c.tenant == job.tenant, sa.tuple_(jobs.c.created_at, jobs.c.id) < (job.created_at, job.id))
         query = sa.select(sa.func.count()).select_from(jobs).where(jobs.c.state == State.QUEUED, ahead)
         with self._database.reading() as read:
             return int(read.execute(query).scalar_one()) + 1
@@ -176,9 +186,12 @@ class Ledger:
 
     def forget(self, job_id: str) -> bool:
         """Delete the row of a finished job."""
-        done = sa.and_(jobs.c.id == job_id, jobs.c.state.in_(list(FINISHED)))
+        done = sa.and_(jobs.c.id == job_id, self._mine(), jobs.c.state.in_(list(FINISHED)))
         with self._database.writing() as write:
             return write.execute(jobs.delete().where(done)).rowcount == 1
+
+    def _mine(self) -> sa.ColumnElement[bool]:
+        return sa.true() if self._tenant is None else jobs.c.tenant == self._tenant
 
     def _requeue(self, job_id: str, attempt: int, message: str, **values: Any) -> bool:
         fresh = {"stage": "", "progress": 0.0, "eta_s": None, "host": None, "heartbeat": None}

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import tifffile
 
+from server.migrations import prepare
 from server.settings import Settings
 from worker.contract import State
 from worker.database import Database
@@ -34,7 +35,7 @@ class Stage:
     def __post_init__(self) -> None:
         (self.data / "jobs").mkdir(parents=True, exist_ok=True)
         self.database = Database(Settings(data=self.data).database)
-        self.database.create_tables()
+        prepare(self.database)
         self.ledger = Ledger(self.database)
 
     def job(self, name: str, state: State = State.QUEUED, **values: Any) -> str:

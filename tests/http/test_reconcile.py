@@ -8,6 +8,7 @@ from uuid import uuid4
 
 import pytest
 
+from server.migrations import prepare
 from server.reconcile import Reconciler
 from server.store import Store
 from worker.contract import DEAD_S, STUCK_S, ErrorKind, State
@@ -57,7 +58,7 @@ class World:
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
     database = Database(f"sqlite:///{tmp_path / 'test.db'}")
-    database.create_tables()
+    prepare(database)
     yield World(tmp_path, database)
     database.close()
 

@@ -9,6 +9,7 @@ from uuid import uuid4
 
 import pytest
 
+from server.migrations import prepare
 from worker.database import Database
 from worker.jobfolder import JobFolder
 from worker.ledger import Job, Ledger
@@ -20,7 +21,7 @@ FAKES = Path(__file__).parent / "fakes"
 @pytest.fixture
 def database(tmp_path: Path) -> Iterator[Database]:
     opened = Database(f"sqlite:///{tmp_path / 'test.db'}")
-    opened.create_tables()
+    prepare(opened)
     yield opened
     opened.close()
 

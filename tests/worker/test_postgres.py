@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import socket
-import subprocess
-import tempfile
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 from sqlalchemy.exc import IntegrityError
 
+from server.migrations import prepare
 from server.store import File, NewJob, Store
 from server.submissions import Claim, Kind
 from worker.contract import State
 from worker.database import Database
 from worker.ledger import Ledger
 
+from ..postgres import emptied, running_postgres
 from .test_ledger import (  # noqa: F401  collected here once more, on the database below
     test_a_scan_is_needed_until_its_job_ends,
     test_a_stale_attempt_is_fenced_off,
@@ -33,48 +29,18 @@ from .test_ledger import (  # noqa: F401  collected here once more, on the datab
 )
 
 pytestmark = pytest.mark.system
-USER = "nobody" if os.geteuid() == 0 else None  # PostgreSQL refuses to run as root
-
-
-def program(name: str) -> str:
-    """A PostgreSQL program; Debian keeps them off the PATH."""
-    versions = sorted(Path("/usr/lib/postgresql").glob(f"*/bin/{name}"))
-    found = shutil.which(name) or (str(versions[-1]) if versions else None)
-    if found is None:
-        pytest.skip(f"no {name} on this system")
-    return found
 
 
 @pytest.fixture(scope="module")
 def url() -> Iterator[str]:
-    """A PostgreSQL server of one's own, on a free loopback port."""
-    initdb, pg_ctl = program("initdb"), program("pg_ctl")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    folder = Path(tempfile.mkdtemp(prefix="splatct-pg-"))
-    if USER:
-        shutil.chown(folder, USER)
-
-    def run(*command: str) -> None:
-        subprocess.run(command, user=USER, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd="/")
-
-    data = str(folder / "data")
-    run(initdb, "-D", data, "-U", "splatct", "-A", "trust", "-E", "UTF8", "--locale", "C", "-N")
-    options = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories={folder}"
-    run(pg_ctl, "-D", data, "-w", "-o", options, "-l", str(folder / "log"), "start")
-    yield f"postgresql+psycopg://splatct@127.0.0.1:{port}/postgres"
-    run(pg_ctl, "-D", data, "-w", "-m", "immediate", "stop")
-    shutil.rmtree(folder)
+    with running_postgres() as address:
+        yield address
 
 
 @pytest.fixture
 def database(url: str) -> Iterator[Database]:
-    from worker.database import metadata
-
-    opened = Database(url)
-    metadata.drop_all(opened.engine)
-    opened.create_tables()
+    opened = Database(emptied(url))
+    prepare(opened)
     yield opened
     opened.close()
 

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from splatct_client.errors import InputError, JobFailed
-from splatct_client.verbs import add_server_option, print_json
+from splatct_client.verbs import add_server_option, connect, print_json
 from splatct_client.verbs.submit import end_text, watch
 
 HELP = "download a job's results, checked against their sha256"
@@ -23,11 +23,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from splatct_client.client import Client
     from splatct_client.outfolder import check_out_folder, fetch_results
 
     check_out_folder(args.out, overwrite=args.overwrite, job_id=args.job)
-    with Client(args.server) as client:
+    with connect(args) as client:
         job = watch(client, args.job) if args.wait else client.job(args.job)
         if job.state in ("failed", "cancelled"):
             raise JobFailed(end_text(job))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from splatct_client.bar import Bar, seconds_text, size_text
 from splatct_client.errors import ClientError, InputError, JobFailed, Problem, ServerProblem
 from splatct_client.scanfolder import ScanFolder, read_scan_folder
-from splatct_client.verbs import add_server_option, print_json
+from splatct_client.verbs import add_server_option, connect, print_json
 
 if TYPE_CHECKING:
     from splatct_client.client import Client
@@ -35,14 +35,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from splatct_client.client import Client
     from splatct_client.outfolder import check_out_folder, fetch_results
 
     options = parse_options(args.option, args.calibrate)
     scan = read_scan_folder(args.scan)
     if args.out:
         check_out_folder(args.out, overwrite=args.overwrite)
-    with Client(args.server) as client:
+    with connect(args) as client:
         check_options(options, client.options())  # before a long upload, not after it
         scan_id = send(client, scan)
         job = client.submit(scan_id, options, args.name)

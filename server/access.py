@@ -1,0 +1,102 @@
+"""Says who a request comes from, before anything reads its body: the one place where identity is established.
+
+Everything is closed but what `_PUBLIC` lists. As long as there never was a key, whoever reaches this
+machine's loopback address is the tenant `local` and may do all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fastapi.concurrency import run_in_threadpool
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Send
+from starlette.types import Scope as Connection
+
+from server.keys import Key, KeyRing, Scope
+from server.problems import ApiProblem, answer
+from splatcore.errors import Problem
+from worker.contract import LOCAL_TENANT
+
+_PUBLIC = frozenset({"/", "/healthz", "/readyz", "/openapi.json"})
+_PUBLIC_BELOW = ("/static/", "/jobs/")  # files of the page, and its shells: no data in either
+_SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Whom a request acts for. `key_id` is None where there are no keys."""
+
+    tenant: str
+    scopes: frozenset[Scope]
+    key_id: str | None = None
+
+    @classmethod
+    def of(cls, key: Key) -> Caller:
+        return cls(key.tenant, key.scopes, key.id)
+
+    def may(self, scope: Scope | None) -> bool:
+        return scope is None or scope in self.scopes or Scope.ADMIN in self.scopes
+
+
+LOCAL = Caller(LOCAL_TENANT, frozenset(Scope))
+
+
+class Access:
+    """Middleware: `request.state.caller`, or 401 or 403. `open_without_keys`: only loopback can reach us."""
+
+    def __init__(self, app: ASGIApp, open_without_keys: bool) -> None:
+        self.app = app
+        self._open_without_keys = open_without_keys
+
+    async def __call__(self, scope: Connection, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and not is_public(scope["method"], scope["path"]):
+            try:
+                caller = await run_in_threadpool(self._identify, scope["app"].state.keys, Headers(scope=scope))
+                _require(caller, needed(scope["method"], scope["path"]))
+            except ApiProblem as problem:
+                await answer(problem)(scope, receive, send)
+                return
+            scope.setdefault("state", {})["caller"] = caller
+        await self.app(scope, receive, send)
+
+    def _identify(self, ring: KeyRing, headers: Headers) -> Caller:
+        if self._open_without_keys and not ring.exist():
+            return LOCAL
+        scheme, _, text = headers.get("authorization", "").partition(" ")
+        if scheme.lower() != "bearer":
+            raise unauthorized("A key is needed.", "is missing")
+        key = ring.find(text.strip())
+        if key is None:
+            raise unauthorized("The key is not valid.", "is not known here, has expired or was revoked")
+        return Caller.of(key)
+
+
+def is_public(method: str, path: str) -> bool:
+    return method in _SAFE and (path in _PUBLIC or path.startswith(_PUBLIC_BELOW))
+
+
+def needed(method: str, path: str) -> Scope | None:
+    """The scope that a call asks for; None: any key will do. Sending in a scan is one thing, whatever its calls."""
+    if path == "/metrics":
+        return Scope.ADMIN
+    if path == "/v1/options":
+        return None
+    if path == "/v1/uploads" or path.startswith("/v1/uploads/"):
+        return Scope.SUBMIT
+    if method in _SAFE:
+        return Scope.READ
+    return Scope.DELETE if method == "DELETE" else Scope.SUBMIT
+
+
+def unauthorized(detail: str, what: str) -> ApiProblem:
+    hint = "send `Authorization: Bearer KEY`; `splatct keys add` on the server makes a key"
+    faults = [Problem("header/authorization", what, hint)]
+    return ApiProblem(401, "unauthorized", detail, faults, headers={"WWW-Authenticate": "Bearer"})
+
+
+def _require(caller: Caller, scope: Scope | None) -> None:
+    if not caller.may(scope):
+        has = ", ".join(sorted(caller.scopes))
+        faults = [Problem("header/authorization", f"has the scopes {has}; {scope} is needed", "use another key")]
+        raise ApiProblem(403, "forbidden", f"The key may not do this: it lacks the scope {scope}.", faults)
