@@ -144,6 +144,8 @@ def _job_links(job: Job) -> dict[str, str]:
     links["stream"] = f"{base}/events/stream"
     if job.state is State.SUCCEEDED:
         links |= {"results": f"{base}/results", "report": f"{base}/report"}
+    elif job.partial:
+        links |= {"partial": f"{base}/partial", "report": f"{base}/report"}
     elif job.state in (State.QUEUED, State.RUNNING):
         links["cancel"] = f"{base}/cancel"
     return links

@@ -55,6 +55,7 @@ class Keeper:
     ) -> None:
         self.file, self._every_s, self._clock = file, every_s, clock
         self.wish = Wish.GO_ON
+        self.concluded = False  # the run was ended with what it had
         self.trouble = ""  # why the last state could not be written; empty when it could
         self.written = 0  # states
         self.seconds = 0.0  # spent on writing them
@@ -87,6 +88,7 @@ class Keeper:
             kept = f"its state is in {self.file}" if self.file and not self.trouble else "its state is not kept"
             raise Stopped(f"the run was stopped as asked; {kept}")
         if self.wish is Wish.CONCLUDE:
+            self.concluded = True
             raise Concluding
 
     def forget(self) -> None:

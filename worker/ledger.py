@@ -42,6 +42,9 @@ jobs = sa.Table(
     sa.Column("started_at", sa.Float),
     sa.Column("finished_at", sa.Float),
     sa.Column("tenant", sa.String(64), nullable=False, server_default=LOCAL_TENANT),
+    sa.Column("priority", sa.Integer, nullable=False, server_default=sa.text("0")),  # worker.contract.Priority
+    sa.Column("partial", sa.Boolean, nullable=False, server_default=sa.false()),  # it left a partial result
+    sa.Column("restart_of", sa.String(36)),  # the job that it was made from
     sa.Index("ix_jobs_tenant_created_at", "tenant", "created_at"),
 )
 
@@ -70,6 +73,9 @@ class Job:
     started_at: float | None
     finished_at: float | None
     tenant: str
+    priority: int
+    partial: bool
+    restart_of: str | None
 
 
 class Ledger:
@@ -154,23 +160,41 @@ class Ledger:
         end = {"stage": "done", "message": "Done", "progress": 1.0}
         return self._move(job_id, attempt, State.RUNNING, State.SUCCEEDED, **end)
 
-    def fail(self, job_id: str, attempt: int, kind: ErrorKind, message: str, was: State = State.RUNNING) -> bool:
-        error = {"error_kind": kind.value, "error_message": message, "message": "Failed"}
+    def fail(
+        self,
+        job_id: str,
+        attempt: int,
+        kind: ErrorKind,
+        message: str,
+        was: State = State.RUNNING,
+        partial: bool = False,
+    ) -> bool:
+        error = {"error_kind": kind.value, "error_message": message, "message": "Failed", "partial": partial}
         return self._move(job_id, attempt, was, State.FAILED, **error)
 
-    def end_cancel(self, job_id: str, attempt: int) -> bool:
-        return self._move(job_id, attempt, State.CANCELLING, State.CANCELLED, message="Cancelled")
+    def end_cancel(self, job_id: str, attempt: int, partial: bool = False) -> bool:
+        message = "Cancelled; what there was is kept as a partial result" if partial else "Cancelled"
+        return self._move(job_id, attempt, State.CANCELLING, State.CANCELLED, message=message, partial=partial)
 
     def hand_back(self, job_id: str, attempt: int) -> bool:
         """Queue the job again because its worker was told to stop: nobody's fault, not counted."""
         return self._requeue(job_id, attempt, "Its worker was stopped; waiting for another")
 
-    def crashed(self, job: Job, what: str) -> bool:
-        """Queue the job again after its attempt died, or fail it if that happened too often."""
-        if job.crashes + 1 < MAX_CRASHES:
-            return self._requeue(job.id, job.attempt, f"{what}; waiting to start again", crashes=job.crashes + 1)
-        message = f"{what}, {job.crashes + 1} times. The machine may be short of memory; the log may say more."
-        return self.fail(job.id, job.attempt, ErrorKind.CRASHED, message)
+    def crashed(self, job: Job, what: str, advanced: bool = False, log_tail: str = "") -> State | None:
+        """Queue the job again after its attempt died, or fail it if that happened too often. Returns what became of it,
+        None if it is no longer that attempt's.
+
+        advanced: the attempt kept a state that the next one goes on from; so it was not this job that is to blame, or
+        at least it does not die at one place for ever.
+        """
+        crashes = 1 if advanced else job.crashes + 1
+        if crashes < MAX_CRASHES:
+            again = self._requeue(job.id, job.attempt, f"{what}; waiting to go on", crashes=crashes)
+            return State.QUEUED if again else None
+        message = f"{what}, {crashes} times without getting further. Restart the job when the cause is gone."
+        if log_tail:
+            message += f" Its log ends with:\n{log_tail}"
+        return State.FAILED if self.fail(job.id, job.attempt, ErrorKind.CRASHED, message) else None
 
     def ask_cancel(self, job_id: str) -> Job | None:
         """Cancel a queued job at once, ask for it when running, leave a finished one alone."""

@@ -25,7 +25,11 @@ class WorkerSettings(BaseSettings):
     database_url: str = Field(default="", repr=False)  # empty: SQLite in the data folder
     redis_url: str = Field(default="redis://127.0.0.1:6379/0", repr=False)
     job_seconds: float = 24 * 3600.0  # longest a job may run
-    cancel_grace_s: float = 10.0  # time for the engine to stop by itself before it is terminated
+    cancel_grace_s: float = 60.0  # for the engine to make a result of what there is, before it is killed
+    drain_grace_s: float = 8.0  # for the engine to keep its state when its worker is to go, before it is killed
+    checkpoint_s: float = 10.0  # at least so long between two writings of the engine's state; 0: it keeps none
+    engine_memory_mib: int = Field(default=0, ge=0)  # 0: all that this machine, or the cgroup, gives
+    engine_file_mib: int = Field(default=1 << 20, ge=1)  # of the largest file the engine may write
     engine: str = "splatcore"  # for tests: the package the engine process takes its functions from
 
     @classmethod

@@ -105,6 +105,7 @@ class Stack:
             "SPLATCT_ENGINE": "fake_engine",
             "SPLATCT_RECONCILE_S": "0.5",
             "SPLATCT_CANCEL_GRACE_S": "1",
+            "SPLATCT_CHECKPOINT_S": "0.2",
         }
         self._log = (folder / "log.txt").open("ab")
         self._processes: list[subprocess.Popen[bytes]] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import itertools
 import os
 import signal
 import time
@@ -54,6 +56,63 @@ def test_a_killed_engine_is_started_again(stack: Stack) -> None:
     done = stack.wait(job_id, "succeeded", "failed")
     assert (done["state"], done["attempt"]) == ("succeeded", 2)
     assert publications(stack, job_id) == 1
+
+
+def steps(stack: Stack, job_id: str, attempt: int) -> list[int]:
+    events = stack.http.get(f"/v1/jobs/{job_id}/events").json()["events"]
+    return [e["step"] for e in events if e.get("attempt") == attempt and e["stage"] == "level"]
+
+
+def test_no_more_than_one_checkpoint_of_work_is_lost(stack: Stack) -> None:
+    """Worker killed, then everything but the data folder killed; the steps say what was done twice."""
+    worker = stack.start_worker()
+    job_id = long_job(stack, steps=120)
+    stack.until(lambda: len(steps(stack, job_id, 1)) > 30, what="thirty steps")
+    kill(worker)
+    worker = stack.start_worker()
+    stack.until(lambda: len(steps(stack, job_id, 2)) > 30, what="thirty more steps")
+    kill(worker)
+    kill(stack.server)
+    stack.redis.kill()
+    stack.redis.start()
+    stack.start_server()
+    stack.start_worker()
+    done = stack.wait(job_id, "succeeded", "failed")
+    assert (done["state"], done["attempt"]) == ("succeeded", 3)
+    ran = [steps(stack, job_id, attempt) for attempt in (1, 2, 3)]
+    assert all(part == list(range(part[0], part[-1] + 1)) for part in ran)
+    for before, after in itertools.pairwise(ran):
+        # 0.2 s at least between two checkpoints, more where writing one takes more than 2 ms; 20 steps in a second
+        assert before[-1] - 40 <= after[0] <= before[-1] + 1
+    assert ran[2][-1] == 119
+    events = stack.http.get(f"/v1/jobs/{job_id}/events").json()["events"]
+    assert sum("Going on from the checkpoint" in event["message"] for event in events) == 2
+
+
+def test_a_drained_worker_loses_no_work(stack: Stack) -> None:
+    worker = stack.start_worker()
+    job_id = long_job(stack, steps=100)
+    stack.until(lambda: len(steps(stack, job_id, 1)) > 30, what="thirty steps")
+    worker.terminate()
+    assert worker.wait(20) == 0
+    stack.start_worker()
+    assert stack.wait(job_id, "succeeded", "failed")["state"] == "succeeded"
+    assert steps(stack, job_id, 2)[0] in (steps(stack, job_id, 1)[-1], steps(stack, job_id, 1)[-1] + 1)
+
+
+def test_what_a_cancelled_job_had_can_be_fetched(stack: Stack) -> None:
+    stack.start_worker()
+    job_id = long_job(stack, steps=400)
+    mid_job(stack, job_id)
+    stack.http.post(f"/v1/jobs/{job_id}/cancel")
+    job = stack.wait(job_id, "cancelled")
+    assert "partial" in job["message"] and stack.http.get(f"/v1/jobs/{job_id}/results").status_code == 409
+    manifest = stack.http.get(job["links"]["partial"]).json()
+    for file in manifest["files"]:
+        got = stack.http.get(f"/v1/jobs/{job_id}/partial/{file['name']}").raise_for_status().content
+        assert hashlib.sha256(got).hexdigest() == file["sha256"]
+    assert stack.http.get(f"/v1/jobs/{job_id}/slices/z/2.png").headers["content-type"] == "image/png"
+    assert stack.http.get(job["links"]["report"]).status_code == 200
 
 
 def test_a_stopped_worker_hands_its_job_back(stack: Stack) -> None:

@@ -34,7 +34,7 @@ def ledger(database: Database) -> Ledger:
 @pytest.fixture
 def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> WorkerSettings:
     monkeypatch.setenv("PYTHONPATH", str(FAKES))
-    return WorkerSettings(data=tmp_path, engine="fake_engine", cancel_grace_s=0.3)
+    return WorkerSettings(data=tmp_path, engine="fake_engine", cancel_grace_s=1.0, checkpoint_s=0.2)
 
 
 @pytest.fixture

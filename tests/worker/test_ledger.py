@@ -58,7 +58,7 @@ def test_crashes_are_counted_and_end(ledger: Ledger, new_job: NewJob) -> None:
         assert claimed is not None and ledger.crashed(claimed, "The engine was killed (SIGKILL)")
     end = current(ledger, job)
     assert (end.state, end.error_kind, end.attempt) == (State.FAILED, ErrorKind.CRASHED, MAX_CRASHES)
-    assert end.error_message is not None and "killed (SIGKILL), 3 times" in end.error_message
+    assert end.error_message is not None and f"killed (SIGKILL), {MAX_CRASHES} times" in end.error_message
     assert end.finished_at is not None
 
 
