@@ -191,18 +191,22 @@ class Client:
 
     # Results
 
-    def results(self, job_id: str) -> list[ResultFile]:
+    # `kind` is "results", or "partial": what a job had when it was cancelled or its time was up.
+
+    def results(self, job_id: str, kind: str = "results") -> list[ResultFile]:
         """The files a finished job left, with size and sha256."""
-        manifest = self._json("GET", f"/v1/jobs/{_id(job_id)}/results")
+        manifest = self._json("GET", f"/v1/jobs/{_id(job_id)}/{kind}")
         return [ResultFile.from_json(file) for file in _items(manifest, "files")]
 
-    def manifest(self, job_id: str) -> bytes:
+    def manifest(self, job_id: str, kind: str = "results") -> bytes:
         """manifest.json itself, which cannot list its own sha256."""
-        return self._request("GET", f"/v1/jobs/{_id(job_id)}/results/manifest.json").content
+        return self._request("GET", f"/v1/jobs/{_id(job_id)}/{kind}/manifest.json").content
 
-    def download(self, job_id: str, file: ResultFile, folder: Path, on_bytes: OnBytes | None = None) -> Path:
+    def download(
+        self, job_id: str, file: ResultFile, folder: Path, on_bytes: OnBytes | None = None, kind: str = "results"
+    ) -> Path:
         """Fetch one result file into `folder`: resumed, checked, and there under its name only when whole."""
-        return fetch_file(self, f"/v1/jobs/{_id(job_id)}/results/{_name(file.name)}", file, folder, on_bytes)
+        return fetch_file(self, f"/v1/jobs/{_id(job_id)}/{kind}/{_name(file.name)}", file, folder, on_bytes)
 
     # The wire
 
