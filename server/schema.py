@@ -37,6 +37,18 @@ class JobIn(Body):
     name: Name | None = None
 
 
+class SessionIn(Body):
+    key: Annotated[str, Field(min_length=1, max_length=4096)]
+
+
+class SessionOut(BaseModel):
+    tenant: str
+    key_id: str | None = Field(description="null where there are no keys")
+    scopes: list[str]
+    expires_at: datetime | None = Field(description="of the session; null for who sends a key")
+    csrf: str | None = Field(description="to be sent as X-CSRF-Token; null without a session")
+
+
 class FileOut(BaseModel):
     name: str
     size: int

@@ -6,6 +6,10 @@ from collections.abc import Callable
 
 import sqlalchemy as sa
 
-from server.migrations import v0001_first, v0002_tenants
+from server.migrations import v0001_first, v0002_tenants, v0003_sessions
 
-STEPS: tuple[Callable[[sa.Connection], None], ...] = (v0001_first.upgrade, v0002_tenants.upgrade)
+STEPS: tuple[Callable[[sa.Connection], None], ...] = (
+    v0001_first.upgrade,
+    v0002_tenants.upgrade,
+    v0003_sessions.upgrade,
+)
