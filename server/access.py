@@ -7,33 +7,36 @@ machine's loopback address is the tenant `local` and may do all.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from hmac import compare_digest
 
 from fastapi.concurrency import run_in_threadpool
-from starlette.datastructures import Headers
+from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as Connection
 
 from server.keys import Key, KeyRing, Scope
 from server.problems import ApiProblem, answer
+from server.sessions import COOKIE, CSRF_HEADER, Sessions, csrf_token
 from splatcore.errors import Problem
 from worker.contract import LOCAL_TENANT
 
-_PUBLIC = frozenset({"/", "/healthz", "/readyz", "/openapi.json"})
+_PUBLIC = frozenset({"/", "/sign-in", "/healthz", "/readyz", "/openapi.json"})
 _PUBLIC_BELOW = ("/static/", "/jobs/")  # files of the page, and its shells: no data in either
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 @dataclass(frozen=True)
 class Caller:
-    """Whom a request acts for. `key_id` is None where there are no keys."""
+    """Whom a request acts for. `key_id` is None where there are no keys, `session_ends` without a session."""
 
     tenant: str
     scopes: frozenset[Scope]
     key_id: str | None = None
+    session_ends: float | None = None
 
     @classmethod
-    def of(cls, key: Key) -> Caller:
-        return cls(key.tenant, key.scopes, key.id)
+    def of(cls, key: Key, session_ends: float | None = None) -> Caller:
+        return cls(key.tenant, key.scopes, key.id, session_ends)
 
     def may(self, scope: Scope | None) -> bool:
         return scope is None or scope in self.scopes or Scope.ADMIN in self.scopes
@@ -52,7 +55,7 @@ class Access:
     async def __call__(self, scope: Connection, receive: Receive, send: Send) -> None:
         if scope["type"] == "http" and not is_public(scope["method"], scope["path"]):
             try:
-                caller = await run_in_threadpool(self._identify, scope["app"].state.keys, Headers(scope=scope))
+                caller = await run_in_threadpool(self._identify, HTTPConnection(scope))
                 _require(caller, needed(scope["method"], scope["path"]))
             except ApiProblem as problem:
                 await answer(problem)(scope, receive, send)
@@ -60,10 +63,14 @@ class Access:
             scope.setdefault("state", {})["caller"] = caller
         await self.app(scope, receive, send)
 
-    def _identify(self, ring: KeyRing, headers: Headers) -> Caller:
+    def _identify(self, request: HTTPConnection) -> Caller:
+        ring: KeyRing = request.app.state.keys
         if self._open_without_keys and not ring.exist():
             return LOCAL
-        scheme, _, text = headers.get("authorization", "").partition(" ")
+        given, token = request.headers.get("authorization"), request.cookies.get(COOKIE)
+        if given is None and token is not None:
+            return _of_session(request, token)
+        scheme, _, text = (given or "").partition(" ")
         if scheme.lower() != "bearer":
             raise unauthorized("A key is needed.", "is missing")
         key = ring.find(text.strip())
@@ -72,7 +79,24 @@ class Access:
         return Caller.of(key)
 
 
+def _of_session(request: HTTPConnection, token: str) -> Caller:
+    """Who signed in. A browser sends the cookie whoever made it ask, so a call that changes something must also
+    send what only a page that reads our answers can know."""
+    sessions: Sessions = request.app.state.sessions
+    session = sessions.find(token)
+    if session is None:
+        raise unauthorized("The session has ended; sign in again.", "is missing, and the session has ended")
+    sent = request.headers.get(CSRF_HEADER, "")
+    if request.scope["method"] not in _SAFE and not compare_digest(sent.encode(), csrf_token(token).encode()):
+        hint = "send `csrf` of GET /v1/session along, or a key in place of the cookie"
+        faults = [Problem(f"header/{CSRF_HEADER.lower()}", "is missing, or not this session's", hint)]
+        raise ApiProblem(403, "csrf", "Another site's page may have made this request.", faults)
+    return Caller.of(session.key, session.expires_at)
+
+
 def is_public(method: str, path: str) -> bool:
+    if (method, path) == ("POST", "/v1/session"):  # signing in
+        return True
     return method in _SAFE and (path in _PUBLIC or path.startswith(_PUBLIC_BELOW))
 
 
@@ -80,7 +104,7 @@ def needed(method: str, path: str) -> Scope | None:
     """The scope that a call asks for; None: any key will do. Sending in a scan is one thing, whatever its calls."""
     if path == "/metrics":
         return Scope.ADMIN
-    if path == "/v1/options":
+    if path in ("/v1/options", "/v1/session"):
         return None
     if path == "/v1/uploads" or path.startswith("/v1/uploads/"):
         return Scope.SUBMIT

@@ -11,7 +11,7 @@ from typing import Any
 from fastapi import FastAPI, Response
 from fastapi.staticfiles import StaticFiles
 
-from server import follow, health, janitor, jobs, metrics, pages, problems, results, resume, scans, uploads
+from server import follow, health, janitor, jobs, metrics, pages, problems, results, resume, scans, signin, uploads
 from server.access import Access
 from server.census import Census, Outcomes
 from server.dispatch import Dispatcher
@@ -23,6 +23,7 @@ from server.migrations import prepare
 from server.observe import Observer
 from server.reconcile import Reconciler, keep_reconciling
 from server.service import Service
+from server.sessions import Sessions
 from server.settings import Settings
 from server.store import Store
 from server.watch import Watch
@@ -61,6 +62,7 @@ def create_app(settings: Settings) -> FastAPI:
         app.state.metrics = Metrics(JobNumbers(Census(database), outcomes, reconciler, settings.data))
         app.state.dispatcher = dispatcher
         app.state.keys = KeyRing(database)
+        app.state.sessions = Sessions(database, app.state.keys, round(settings.session_hours * 3600))
         tasks = [
             asyncio.create_task(keep_reconciling(reconciler, settings.reconcile_s, wake)),
             asyncio.create_task(watch.keep_looking()),
@@ -87,7 +89,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(Access, open_without_keys=settings.only_loopback_reaches_us)
     app.add_middleware(Guard, allowed_hosts=settings.host_names)
     app.add_middleware(Observer)
-    for part in (uploads, resume, scans, jobs, follow, results, health, metrics):
+    for part in (signin, uploads, resume, scans, jobs, follow, results, health, metrics):
         app.include_router(part.router)
     app.include_router(pages.router)
     app.mount("/static", _Static(directory=Path(__file__).parent / "static"), name="static")

@@ -13,17 +13,10 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.headers import add_to
 from server.problems import response
 
 MIB = 1 << 20
-_HEADERS = {
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
-    "object-src 'none'; base-uri 'none'; frame-ancestors 'none'; form-action 'self'",
-}
 
 
 class Guard:
@@ -39,8 +32,7 @@ class Guard:
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                for name, value in _HEADERS.items():
-                    MutableHeaders(scope=message).setdefault(name, value)
+                add_to(MutableHeaders(scope=message), scope["scheme"], scope["path"])
             await send(message)
 
         if not self._is_ours(headers.get("host", "")):

@@ -24,6 +24,7 @@ class Settings(WorkerSettings):
     check: str = "splatcore.check"  # for tests: the module that judges an uploaded scan
     check_memory_mib: int = 8192  # address space of that check; a hostile TIFF gets no further
     disk_floor_mib: int = 512  # kept free: no upload may take the last of the disk
+    session_hours: float = Field(default=12.0, gt=0)  # of the page; then it asks for the key again
     stale_upload_hours: float = 48.0
     reconcile_s: float = 2.0
     log_format: Literal["json", "text"] = "json"

@@ -11,7 +11,7 @@ from uuid import uuid4
 import sqlalchemy as sa
 
 from server.submissions import Claim, Submissions
-from worker.contract import LOCAL_TENANT
+from worker.contract import LOCAL_TENANT, Priority
 from worker.database import Database, metadata
 from worker.ledger import Ledger
 
@@ -109,6 +109,8 @@ class NewJob:
     name: str
     options: dict[str, Any]
     claim: Claim | None = None
+    priority: Priority = Priority.NORMAL
+    restart_of: str | None = None
 
 
 class Store:
@@ -259,7 +261,8 @@ class Store:
             mine = sa.and_(scans.c.id == scan.id, self._mine(scans))
             if write.execute(sa.select(scans.c.id).where(mine)).first() is None:
                 return False
-            self.jobs.add(write, job.id, job.name, (scan.id, scan.name), job.options)
+            named = (scan.id, scan.name)
+            self.jobs.add(write, job.id, job.name, named, job.options, job.priority, job.restart_of)
             if job.claim is not None:
                 self.submissions.add(write, job.claim, job.id)
             place()

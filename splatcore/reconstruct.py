@@ -25,6 +25,7 @@ from splatcore.checkpoint import identity
 from splatcore.conclusion import conclude, mark_partial
 from splatcore.descent import Descent, Rates
 from splatcore.errors import OptionsError, ReconstructionError
+from splatcore.estimate import default_splats
 from splatcore.exposure import finding
 from splatcore.gate import Decision, Score
 from splatcore.geometry import RigidMotions
@@ -109,9 +110,7 @@ def resolved(scan: Scan, options: Options) -> Options:
             "a view moves; use none"
         )
     threads = options.threads or threads_allowed()
-    edge = scan.volume.voxels ** (1 / 3) / 128
-    # Finer voxels show more detail, but as few views hold it no better: past 128 many more splats would fit noise.
-    splats = options.splats or int(np.clip(30_000 * min(edge**1.5, edge**0.5), 2_000, 2_000_000))
+    splats = options.splats or default_splats(scan.volume.voxels)
     return replace(options, threads=threads, splats=splats)
 
 

@@ -87,6 +87,12 @@ class JobFolder:
         for folder in (self.scan, self.path, self.path.parent):
             sync_folder(folder)
 
+    def go_on_from(self, earlier: JobFolder) -> None:
+        """Begin with the state that an earlier job of the same scan was left in, if there is one. The engine uses it
+        where the options are the same too."""
+        with contextlib.suppress(FileNotFoundError):
+            link_or_copy(earlier.checkpoint, self.checkpoint)
+
     def become(self, other: JobFolder) -> None:
         """Take the place of `other`, where only a request that was cut short may have left something."""
         other.remove()
@@ -172,12 +178,14 @@ class JobFolder:
             shutil.rmtree(left, ignore_errors=True)
 
     def tidy(self) -> None:
-        """After the end: drop what only a running job needs. The scan is kept by the scan store."""
+        """After the end: drop what only a running job needs. The scan is kept by the scan store; the state, without
+        which a restart would begin anew, where there are no results."""
         self.discard_attempts()
         shutil.rmtree(self.scratch, ignore_errors=True)
         shutil.rmtree(self.scan, ignore_errors=True)
         self.cancel.unlink(missing_ok=True)
-        self.checkpoint.unlink(missing_ok=True)
+        if self.published():
+            self.checkpoint.unlink(missing_ok=True)
         self.checkpoint.with_name(f".{self.checkpoint.name}.part").unlink(missing_ok=True)
 
     def remove(self) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from worker.contract import ACTIVE, FINISHED, LOCAL_TENANT, MAX_CRASHES, TRANSITIONS, ErrorKind, State
+from worker.contract import ACTIVE, FINISHED, LOCAL_TENANT, MAX_CRASHES, TRANSITIONS, ErrorKind, Priority, State
 from worker.database import Database, metadata
 
 _STATE = sa.Enum(State, native_enum=False, length=16, values_callable=lambda states: [s.value for s in states])
@@ -46,6 +46,7 @@ jobs = sa.Table(
     sa.Column("partial", sa.Boolean, nullable=False, server_default=sa.false()),  # it left a partial result
     sa.Column("restart_of", sa.String(36)),  # the job that it was made from
     sa.Index("ix_jobs_tenant_created_at", "tenant", "created_at"),
+    sa.Index("ix_jobs_tenant_started_at", "tenant", "started_at"),
 )
 
 
@@ -89,10 +90,19 @@ class Ledger:
         self._database = database
         self._tenant = tenant
 
-    def add(self, write: sa.Connection, job_id: str, name: str, scan: tuple[str, str], options: dict[str, Any]) -> None:
+    def add(
+        self,
+        write: sa.Connection,
+        job_id: str,
+        name: str,
+        scan: tuple[str, str],
+        options: dict[str, Any],
+        priority: Priority = Priority.NORMAL,
+        restart_of: str | None = None,
+    ) -> None:
         """Insert a queued job within the caller's transaction. `scan` is (id, name)."""
-        row = {"id": job_id, "name": name, "scan_id": scan[0], "scan_name": scan[1], "options": options}
-        row["tenant"] = self._tenant or LOCAL_TENANT
+        row: dict[str, Any] = {"id": job_id, "name": name, "scan_id": scan[0], "scan_name": scan[1], "options": options}
+        row |= {"tenant": self._tenant or LOCAL_TENANT, "priority": int(priority), "restart_of": restart_of}
         write.execute(jobs.insert().values(**row, state=State.QUEUED, message="Waiting", created_at=time.time()))
 
     def get(self, job_id: str) -> Job | None:
@@ -122,18 +132,53 @@ class Ledger:
             return [_job(row) for row in read.execute(sa.select(jobs).where(jobs.c.id.in_(ids)))]
 
     def positions(self) -> dict[str, int]:
-        """The `position` of every queued job."""
-        place = sa.func.row_number().over(partition_by=jobs.c.tenant, order_by=[jobs.c.created_at, jobs.c.id])
+        """The place of every queued job among its tenant's, 1 for the one that is next: how many others wait is
+        theirs to know."""
         with self._database.reading() as read:
-            query = sa.select(jobs.c.id, place).where(jobs.c.state == State.QUEUED)
+            query = sa.select(jobs.c.id, _place()).where(jobs.c.state == State.QUEUED)
             return {job_id: int(number) for job_id, number in read.execute(query)}
 
     def position(self, job: Job) -> int:
-        """1 for the queued job that is the next of its tenant's: how many others wait is theirs to know."""
-        ahead = sa.and_(jobs.c.tenant == job.tenant, sa.tuple_(jobs.c.created_at, jobs.c.id) < (job.created_at, job.id))
+        """That of one queued job."""
+        before = sa.or_(
+            jobs.c.priority > job.priority,
+            sa.and_(
+                jobs.c.priority == job.priority,
+                sa.tuple_(jobs.c.created_at, jobs.c.id) < (job.created_at, job.id),
+            ),
+        )
+        ahead = sa.and_(jobs.c.tenant == job.tenant, before)
         query = sa.select(sa.func.count()).select_from(jobs).where(jobs.c.state == State.QUEUED, ahead)
         with self._database.reading() as read:
             return int(read.execute(query).scalar_one()) + 1
+
+    def line(self, limit: int) -> list[Job]:
+        """The queued jobs that are next, in order: within a tenant by priority, then by age. Between tenants the one
+        with the fewest jobs at work, each waiting one counted to those before it; of equals the one that was served
+        the longest time ago. So a tenant with a thousand jobs keeps nobody else waiting for more than one."""
+        at_work = (
+            sa.select(jobs.c.tenant, sa.func.count().label("jobs"))
+            .where(jobs.c.state.in_([State.RUNNING, State.CANCELLING]))
+            .group_by(jobs.c.tenant)
+            .subquery()
+        )
+        served = sa.select(jobs.c.tenant, sa.func.max(jobs.c.started_at).label("at")).group_by(jobs.c.tenant).subquery()
+        waiting = sa.select(jobs.c.id, _place().label("place")).where(jobs.c.state == State.QUEUED).subquery()
+        query = (
+            sa.select(jobs)
+            .join(waiting, waiting.c.id == jobs.c.id)
+            .outerjoin(at_work, at_work.c.tenant == jobs.c.tenant)
+            .outerjoin(served, served.c.tenant == jobs.c.tenant)
+            .order_by(
+                waiting.c.place + sa.func.coalesce(at_work.c.jobs, 0),
+                sa.func.coalesce(served.c.at, 0),
+                jobs.c.created_at,
+                jobs.c.id,
+            )
+            .limit(limit)
+        )
+        with self._database.reading() as read:
+            return [_job(row) for row in read.execute(query)]
 
     def needs_scan(self, read: sa.Connection, scan_id: str) -> bool:
         query = sa.select(jobs.c.id).where(jobs.c.scan_id == scan_id, jobs.c.state.in_(list(ACTIVE))).limit(1)
@@ -229,6 +274,12 @@ class Ledger:
         expected = sa.and_(jobs.c.id == job_id, jobs.c.attempt == attempt, jobs.c.state == old)
         with self._database.writing() as write:
             return write.execute(jobs.update().where(expected).values(state=new, **values)).rowcount == 1
+
+
+def _place() -> sa.ColumnElement[int]:
+    """The order of a tenant's queued jobs, from 1."""
+    order = [jobs.c.priority.desc(), jobs.c.created_at, jobs.c.id]
+    return sa.func.row_number().over(partition_by=jobs.c.tenant, order_by=order)
 
 
 def _job(row: sa.Row[Any]) -> Job:

@@ -30,6 +30,7 @@ from worker.settings import WorkerSettings
 
 log = logging.getLogger("splatct.worker")
 
+IN_LINE = 20  # jobs to try for; more workers than that never ask at one moment
 LOCK_WAIT_S = 3.0  # an engine that was just killed needs a moment to let go
 TICK_S = 0.5
 DATABASE_PATIENCE_S = 600.0
@@ -63,7 +64,10 @@ class StopFlag:
 
 
 def run_job(job_id: str, attempt: int) -> None:
-    """Entry point for RQ. Says nothing to RQ: the ledger is where outcomes go."""
+    """Entry point for RQ. Says nothing to RQ: the ledger is where outcomes go.
+
+    What the queue names is only a sign that a job waits; which one is next the ledger says.
+    """
     assert "torch" not in sys.modules, "the worker process must stay light; only the engine imports torch"
     worker = os.environ.get("SPLATCT_WORKER_PID")
     if worker is not None:
@@ -71,26 +75,38 @@ def run_job(job_id: str, attempt: int) -> None:
     settings = WorkerSettings()
     database = Database(settings.database)
     try:
-        supervise(settings, Ledger(database), job_id, attempt)
+        log.debug("woken for job %s, attempt %d", job_id, attempt)
+        work_on_next(settings, Ledger(database))
     finally:
         database.close()
 
 
-def supervise(settings: WorkerSettings, ledger: Ledger, job_id: str, attempt: int) -> None:
-    """Claim the attempt and see it through; return quietly when it is not to be had."""
+def work_on_next(settings: WorkerSettings, ledger: Ledger) -> bool:
+    """See the next job in line through; False if none is to be had. Others take jobs at the same time: whom another
+    has is passed over. The first is asked for again with patience, as its last engine may just be dying."""
+    line = ledger.line(IN_LINE)
+    tries = [(job, 0.0) for job in line] + [(job, LOCK_WAIT_S) for job in line[:1]]
+    return any(supervise(settings, ledger, job.id, job.attempt, patience_s) for job, patience_s in tries)
+
+
+def supervise(
+    settings: WorkerSettings, ledger: Ledger, job_id: str, attempt: int, patience_s: float = LOCK_WAIT_S
+) -> bool:
+    """Claim the attempt and see it through; False, and nothing done, when it is not to be had."""
     stop = StopFlag()
     signal.signal(signal.SIGTERM, stop)
     folder = JobFolder(settings.data.absolute(), job_id)
-    with folder.lock(LOCK_WAIT_S) as lock:
+    with folder.lock(patience_s) as lock:
         if lock is None or stop.set:
-            return  # deleted, or another process still works on it: the reconcile loop will ask again
+            return False  # deleted, or another process still works on it: the reconcile loop will ask again
         job = ledger.claim(job_id, attempt, host_id())
         if job is None:
-            return
+            return False
         try:
             _Attempt(settings, ledger, folder, job, lock, stop).run()
         except Lost:
             log.warning("job %s: attempt %d is no longer ours", job_id, attempt)
+        return True
 
 
 class _Attempt:

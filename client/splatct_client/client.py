@@ -138,10 +138,19 @@ class Client:
         """Every reconstruction option the server knows: name, default, choices, range, help."""
         return _items(self._json("GET", "/v1/options"), "options")
 
-    def submit(self, scan_id: str, options: dict[str, Any] | None = None, name: str | None = None) -> Job:
+    def submit(
+        self,
+        scan_id: str,
+        options: dict[str, Any] | None = None,
+        name: str | None = None,
+        priority: str | None = None,
+    ) -> Job:
+        """priority: low, normal or high among one's own jobs."""
         body: dict[str, Any] = {"scan_id": scan_id, "options": options or {}}
         if name is not None:
             body["name"] = name
+        if priority is not None:
+            body["priority"] = priority
         try:  # under an id of our own it can be repeated until there is an answer, and there is one job
             return Job.from_json(self._json("PUT", f"/v1/jobs/{uuid4()}", json=body))
         except ServerProblem as problem:

@@ -67,7 +67,7 @@ def test_success(run: Run, new_job: NewJob, tmp_path: Path) -> None:
     job = run(new_job(steps=4))
     folder = JobFolder(tmp_path, job.id)
     assert (job.state, job.progress, job.error_kind) == (State.SUCCEEDED, 1.0, None)
-    assert folder.published()
+    assert folder.published() and not folder.checkpoint.exists()
     assert not folder.scan.exists() and not list(folder.path.glob("attempt-*"))
     events = read_events(folder.events, 0, 100)
     assert [e["stage"] for e in events] == ["read", "level", "level", "level", "level"]
@@ -101,7 +101,6 @@ def test_a_killed_engine_is_tried_again_but_not_for_ever(run: Run, new_job: NewJ
     assert (job.state, job.error_kind) == (State.FAILED, ErrorKind.CRASHED)
     message = job.error_message or ""
     assert "SIGKILL" in message and "environment: " in message  # the end of its log
-    assert not JobFolder(tmp_path, job.id).checkpoint.exists()
 
 
 def test_an_engine_that_gets_further_each_time_is_not_given_up(
@@ -182,7 +181,7 @@ def test_cancel_between_events(run: Run, ledger: Ledger, new_job: NewJob, tmp_pa
     assert not folder.published() and ended.partial and "partial" in ended.message
     assert json.loads((folder.partial / "manifest.json").read_text())["partial"] is True
     assert sorted(path.name for path in folder.path.iterdir()) == [
-        ".lock", "events.jsonl", "job.json", "log.txt", "partial"
+        ".lock", "events.jsonl", "job.json", "log.txt", "partial", "run.checkpoint"
     ]  # fmt: skip
 
 

@@ -29,6 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--option", metavar="NAME=VALUE", action="append", default=[], help="an option of the engine; may be repeated"
     )
+    parser.add_argument("--priority", choices=("low", "normal", "high"), help="among your own jobs; default normal")
     parser.add_argument("--wait", action="store_true", help="stay until the job has finished")
     parser.add_argument("-o", "--out", metavar="OUT", type=Path, help="wait, then fetch the results into this folder")
     parser.add_argument("--overwrite", action="store_true", help="let OUT have files in it")
@@ -44,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     with connect(args) as client:
         check_options(options, client.options())  # before a long upload, not after it
         scan_id = send(client, scan)
-        job = client.submit(scan_id, options, args.name)
+        job = client.submit(scan_id, options, args.name, args.priority)
         _tell(args, f"job {job.id} is {job.state}; its page: {client.base_url}/jobs/{job.id}")
         fetched: list[Path] = []
         if args.wait or args.out:

@@ -1,4 +1,4 @@
-"""Version 3: jobs have a priority, may be made from earlier ones, and may end with a partial result."""
+"""Version 4: jobs have a priority, may be made from earlier ones, and may end with a partial result."""
 
 from __future__ import annotations
 
@@ -10,3 +10,4 @@ def upgrade(write: sa.Connection) -> None:
     for column in ("priority INTEGER DEFAULT 0 NOT NULL", f"partial BOOLEAN DEFAULT {no} NOT NULL",
                    "restart_of VARCHAR(36)"):  # fmt: skip
         write.execute(sa.text(f"ALTER TABLE jobs ADD COLUMN {column}"))
+    write.execute(sa.text("CREATE INDEX ix_jobs_tenant_started_at ON jobs (tenant, started_at)"))
