@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,15 @@ from server.metrics import JobNumbers, Metrics
 from server.migrations import prepare
 from server.observe import Observer
 from server.reconcile import Reconciler, keep_reconciling
+from server.rehearsal import DropUploads
 from server.service import Service
 from server.sessions import Sessions
 from server.settings import Settings
 from server.store import Store
 from server.watch import Watch
 from worker.database import Database
+
+log = logging.getLogger("splatct.server")
 
 
 class _Static(StaticFiles):
@@ -86,6 +90,9 @@ def create_app(settings: Settings) -> FastAPI:
         separate_input_output_schemas=False,
     )
     problems.install(app)
+    if settings.test_mode:
+        log.warning("test mode is on: jobs and uploads may fail on purpose")
+        app.add_middleware(DropUploads, share=settings.test_drop_uploads)
     app.add_middleware(Access, open_without_keys=settings.only_loopback_reaches_us)
     app.add_middleware(Guard, allowed_hosts=settings.host_names)
     app.add_middleware(Observer)

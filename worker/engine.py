@@ -15,28 +15,25 @@ import errno
 import importlib
 import json
 import os
-import signal
 import sys
-import time
 import traceback
 from collections.abc import Callable, Generator
 from pathlib import Path
-from types import FrameType
 from typing import Any, TextIO
 
 from splatcore.errors import OptionsError, ReconstructionError, ScanError
-from splatcore.keeper import Keeper, State, Stopped, Wish
+from splatcore.keeper import Stopped, Wish
 from splatcore.options import Options
 from splatcore.progress import Progress
 from worker.contract import Exit
 from worker.jobfolder import JobFolder
 from worker.lifeline import die_with_parent
 from worker.limits import limit_self
+from worker.requests import Requests
 
 Say = Callable[[dict[str, Any]], None]
 
 _ASKED = {Wish.CONCLUDE: Exit.CANCELLED, Wish.STOP: Exit.STOPPED}
-_LOOK_S = 0.2  # between two looks for the file that cancels
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -64,42 +61,27 @@ def main(arguments: list[str] | None = None) -> int:
             return code
 
 
-class Requests(Keeper):
-    """The keeper of a job's run: it hears of SIGTERM, and looks for the file that cancels."""
-
-    def __init__(self, folder: JobFolder, every_s: float) -> None:
-        super().__init__(folder.checkpoint if every_s else None, every_s)
-        self._cancel, self._looked = folder.cancel, 0.0
-        signal.signal(signal.SIGTERM, self._stop)
-
-    def _stop(self, _signal: int, _frame: FrameType | None) -> None:
-        self.wish = Wish.STOP
-
-    def look(self) -> None:
-        now = time.monotonic()
-        if now - self._looked >= _LOOK_S and self.wish is Wish.GO_ON:
-            self._looked = now
-            if self._cancel.exists():
-                self.wish = Wish.CONCLUDE
-
-    def pause(self, state: Callable[[], State], stage_ends: bool = False) -> None:
-        self.look()
-        super().pause(state, stage_ends)
-
-
 def _work(folder: JobFolder, attempt: int, engine: str, say: Say) -> int:
     spec = json.loads(folder.spec.read_bytes())
     limit_self(spec.get("memory_mib", 0), spec.get("file_mib", 1 << 20))
     options = Options.from_dict(spec["options"])
-    requests = Requests(folder, spec.get("checkpoint_s", 0.0))
+    requests = _requests(folder, attempt, spec)
     scan = _part(engine, "scan", "read_scan")(folder.scan)
-    requests.look()
-    if requests.wish is not Wish.GO_ON:  # before there was anything to keep
+    if requests.look() in _ASKED:  # before there was anything to keep
         return _ASKED[requests.wish]
     events = _part(engine, "reconstruct", "reconstruct")(scan, options, requests)
     reconstruction = _drive(events, say)
     _part(engine, "results", "write_results")(reconstruction, folder.attempt(attempt))
     return Exit.CANCELLED if requests.concluded else Exit.OK
+
+
+def _requests(folder: JobFolder, attempt: int, spec: dict[str, Any]) -> Requests:
+    every_s, plan = spec.get("checkpoint_s", 0.0), spec.get("test")
+    if plan is None:
+        return Requests(folder, every_s)
+    from worker.rehearsal import Rehearsal
+
+    return Rehearsal(folder, every_s, attempt, plan)
 
 
 def _drive(events: Generator[Progress, None, Any], say: Say) -> Any:
