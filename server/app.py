@@ -11,7 +11,21 @@ from typing import Any
 from fastapi import FastAPI, Response
 from fastapi.staticfiles import StaticFiles
 
-from server import follow, health, janitor, jobs, metrics, pages, problems, results, resume, scans, signin, uploads
+from server import (
+    follow,
+    health,
+    janitor,
+    jobs,
+    metrics,
+    pages,
+    problems,
+    results,
+    resume,
+    scans,
+    signin,
+    uploads,
+    usage,
+)
 from server.access import Access
 from server.census import Census, Outcomes
 from server.dispatch import Dispatcher
@@ -21,6 +35,8 @@ from server.keys import KeyRing
 from server.metrics import JobNumbers, Metrics
 from server.migrations import prepare
 from server.observe import Observer
+from server.quotas import Quotas
+from server.rates import Buckets, Rates
 from server.reconcile import Reconciler, keep_reconciling
 from server.service import Service
 from server.sessions import Sessions
@@ -53,14 +69,19 @@ def create_app(settings: Settings) -> FastAPI:
         watch = Watch(store.jobs, settings.data)
         reconciler = Reconciler(store.jobs, dispatcher, settings.data)
         outcomes = Outcomes(database)
+        quotas = Quotas(round(settings.tenant_gib * (1 << 30)), settings.tenant_jobs)
         loop, wake = asyncio.get_running_loop(), asyncio.Event()
 
         def wake_up() -> None:
             loop.call_soon_threadsafe(wake.set)
 
-        app.state.service = Service(settings, store, intake, watch, outcomes, wake_up)
+        app.state.service = Service(settings, store, intake, watch, outcomes, quotas, wake_up)
         app.state.metrics = Metrics(JobNumbers(Census(database), outcomes, reconciler, settings.data))
         app.state.dispatcher = dispatcher
+        app.state.rates = Rates(
+            Buckets(settings.rate_per_s, settings.rate_burst),
+            Buckets(settings.failures_per_min / 60, max(1, round(settings.failures_per_min))),
+        )
         app.state.keys = KeyRing(database)
         app.state.sessions = Sessions(database, app.state.keys, round(settings.session_hours * 3600))
         tasks = [
@@ -89,7 +110,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(Access, open_without_keys=settings.only_loopback_reaches_us)
     app.add_middleware(Guard, allowed_hosts=settings.host_names)
     app.add_middleware(Observer)
-    for part in (signin, uploads, resume, scans, jobs, follow, results, health, metrics):
+    for part in (signin, uploads, resume, scans, jobs, follow, results, health, metrics, usage):
         app.include_router(part.router)
     app.include_router(pages.router)
     app.mount("/static", _Static(directory=Path(__file__).parent / "static"), name="static")

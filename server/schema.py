@@ -138,6 +138,16 @@ class EventList(BaseModel):
     last: int = Field(description="number of the last event given; pass it as `after` next time")
 
 
+class Taken(BaseModel):
+    used: int
+    limit: int | None = Field(description="null: none")
+
+
+class Usage(BaseModel):
+    bytes: Taken = Field(description="announced by open uploads, and of scans")
+    active_jobs: Taken = Field(description="queued or running")
+
+
 class Readiness(BaseModel):
     ready: bool
     database: bool

@@ -24,6 +24,11 @@ class Settings(WorkerSettings):
     check: str = "splatcore.check"  # for tests: the module that judges an uploaded scan
     check_memory_mib: int = 8192  # address space of that check; a hostile TIFF gets no further
     disk_floor_mib: int = 512  # kept free: no upload may take the last of the disk
+    tenant_gib: float = Field(default=0.0, ge=0)  # of uploads and scans that one tenant may keep; 0: no limit
+    tenant_jobs: int = Field(default=0, ge=0)  # of one tenant that may wait and run together; 0: no limit
+    rate_per_s: float = Field(default=50.0, ge=0)  # requests of one key, on the long run; 0: no limit
+    rate_burst: int = Field(default=200, ge=1)  # and at once
+    failures_per_min: float = Field(default=10.0, ge=0)  # keys from one address that are none; 0: no limit
     session_hours: float = Field(default=12.0, gt=0)  # of the page; then it asks for the key again
     stale_upload_hours: float = 48.0
     reconcile_s: float = 2.0

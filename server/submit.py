@@ -55,7 +55,7 @@ def _queue(service: Service, scan: Scan, job: NewJob) -> None:
     made, folder = service.folder(f".new-{uuid4()}"), service.folder(job.id)
     try:
         made.create(service.intake.scan_folder(scan.id))
-        queued = service.store.add_job(job, scan, lambda: made.become(folder))
+        queued = service.store.add_job(job, scan, lambda: made.become(folder), service.quotas.place_for(service.tenant))
     except FileNotFoundError:
         queued = False
     finally:
