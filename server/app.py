@@ -27,6 +27,7 @@ from server import (
     usage,
 )
 from server.access import Access
+from server.audit import AuditLog
 from server.census import Census, Outcomes
 from server.dispatch import Dispatcher
 from server.guard import Guard
@@ -43,6 +44,7 @@ from server.sessions import Sessions
 from server.settings import Settings
 from server.store import Store
 from server.watch import Watch
+from server.witness import Witness
 from worker.database import Database
 
 
@@ -78,6 +80,7 @@ def create_app(settings: Settings) -> FastAPI:
         app.state.service = Service(settings, store, intake, watch, outcomes, quotas, wake_up)
         app.state.metrics = Metrics(JobNumbers(Census(database), outcomes, reconciler, settings.data))
         app.state.dispatcher = dispatcher
+        app.state.audit = AuditLog(database)
         app.state.rates = Rates(
             Buckets(settings.rate_per_s, settings.rate_burst),
             Buckets(settings.failures_per_min / 60, max(1, round(settings.failures_per_min))),
@@ -107,6 +110,7 @@ def create_app(settings: Settings) -> FastAPI:
         separate_input_output_schemas=False,
     )
     problems.install(app)
+    app.add_middleware(Witness)
     app.add_middleware(Access, open_without_keys=settings.only_loopback_reaches_us)
     app.add_middleware(Guard, allowed_hosts=settings.host_names)
     app.add_middleware(Observer)

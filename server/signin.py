@@ -35,6 +35,7 @@ def sign_in(body: SessionIn, request: Request, response: Response) -> SessionOut
         rates.failures.take(address)
         raise ApiProblem(401, "unauthorized", "This key is not known here, has expired or was revoked.")
     session, token = sessions.begin(key)
+    request.state.caller = caller = Caller.of(key, session.expires_at)
     response.set_cookie(
         COOKIE,
         token,
@@ -44,7 +45,7 @@ def sign_in(body: SessionIn, request: Request, response: Response) -> SessionOut
         httponly=True,
         samesite="strict",
     )
-    return _out(Caller.of(key, session.expires_at), csrf_token(token))
+    return _out(caller, csrf_token(token))
 
 
 @router.get("")
