@@ -25,10 +25,12 @@ from server import (
     signin,
     uploads,
     usage,
+    webhooks,
 )
 from server.access import Access
 from server.audit import AuditLog
 from server.census import Census, Outcomes
+from server.deliveries import Outbox, keep_delivering
 from server.dispatch import Dispatcher
 from server.guard import Guard
 from server.intake import Intake
@@ -70,7 +72,7 @@ def create_app(settings: Settings) -> FastAPI:
         dispatcher = Dispatcher(settings.redis_url)
         watch = Watch(store.jobs, settings.data)
         reconciler = Reconciler(store.jobs, dispatcher, settings.data)
-        outcomes = Outcomes(database)
+        outcomes, outbox = Outcomes(database), Outbox(database, settings.webhook_retry_s)
         quotas = Quotas(round(settings.tenant_gib * (1 << 30)), settings.tenant_jobs)
         loop, wake = asyncio.get_running_loop(), asyncio.Event()
 
@@ -91,6 +93,7 @@ def create_app(settings: Settings) -> FastAPI:
             asyncio.create_task(keep_reconciling(reconciler, settings.reconcile_s, wake)),
             asyncio.create_task(watch.keep_looking()),
             asyncio.create_task(janitor.keep_clean(store, intake, settings.data, settings.stale_upload_hours * 3600.0)),
+            asyncio.create_task(keep_delivering(outbox, settings.webhook_networks)),
         ]
         try:
             yield
@@ -111,10 +114,10 @@ def create_app(settings: Settings) -> FastAPI:
     )
     problems.install(app)
     app.add_middleware(Witness)
-    app.add_middleware(Access, open_without_keys=settings.only_loopback_reaches_us)
+    app.add_middleware(Access, open_without_keys=settings.may_be_open)
     app.add_middleware(Guard, allowed_hosts=settings.host_names)
     app.add_middleware(Observer)
-    for part in (signin, uploads, resume, scans, jobs, follow, results, health, metrics, usage):
+    for part in (signin, uploads, resume, scans, jobs, follow, results, health, metrics, usage, webhooks):
         app.include_router(part.router)
     app.include_router(pages.router)
     app.mount("/static", _Static(directory=Path(__file__).parent / "static"), name="static")

@@ -34,6 +34,8 @@ ACTIONS = {
     ("GET", "/v1/jobs/{job_id}/report"): "read-results",
     ("GET", "/v1/jobs/{job_id}/slices/{axis}/{index}.png"): "read-results",
     ("GET", "/v1/jobs/{job_id}/log"): "read-log",
+    ("POST", "/v1/webhooks"): "add-webhook",
+    ("DELETE", "/v1/webhooks/{webhook_id}"): "delete-webhook",
     ("POST", "/v1/session"): "sign-in",
     ("DELETE", "/v1/session"): "sign-out",
 }
@@ -89,7 +91,7 @@ def _deed(scope: Scope, status: int, headers: Headers) -> Deed | None:
     caller: Caller | None = scope.get("state", {}).get("caller")
     given = scope.get("path_params", {})
     made = headers.get("Location", "").rpartition("/")[2]
-    thing = next((str(given[name]) for name in ("job_id", "scan_id", "upload_id") if name in given), made)
+    thing = next((str(given[name]) for name in ("job_id", "scan_id", "upload_id", "webhook_id") if name in given), made)
     reading = action.startswith("read-")
     return Deed(
         tenant="" if caller is None else caller.tenant,
