@@ -6,16 +6,19 @@ machine's loopback address is the tenant `local` and may do all.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from hmac import compare_digest
 
 from fastapi.concurrency import run_in_threadpool
+from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection
-from starlette.types import ASGIApp, Receive, Send
+from starlette.types import ASGIApp, Message, Receive, Send
 from starlette.types import Scope as Connection
 
 from server.keys import Key, KeyRing, Scope
 from server.problems import ApiProblem, answer
+from server.rates import Drawn, Rates, neighbourhood
 from server.sessions import COOKIE, CSRF_HEADER, Sessions, csrf_token
 from splatcore.errors import Problem
 from worker.contract import LOCAL_TENANT
@@ -56,11 +59,14 @@ class Access:
         if scope["type"] == "http" and not is_public(scope["method"], scope["path"]):
             try:
                 caller = await run_in_threadpool(self._identify, HTTPConnection(scope))
+                scope.setdefault("state", {})["caller"] = caller
+                drawn = _draw(scope["app"].state.rates, caller)
                 _require(caller, needed(scope["method"], scope["path"]))
             except ApiProblem as problem:
                 await answer(problem)(scope, receive, send)
                 return
-            scope.setdefault("state", {})["caller"] = caller
+            if drawn is not None:
+                send = _adding(send, drawn.headers())
         await self.app(scope, receive, send)
 
     def _identify(self, request: HTTPConnection) -> Caller:
@@ -75,6 +81,7 @@ class Access:
             raise unauthorized("A key is needed.", "is missing")
         key = ring.find(text.strip())
         if key is None:
+            count_failure(request)
             raise unauthorized("The key is not valid.", "is not known here, has expired or was revoked")
         return Caller.of(key)
 
@@ -92,6 +99,37 @@ def _of_session(request: HTTPConnection, token: str) -> Caller:
         faults = [Problem(f"header/{CSRF_HEADER.lower()}", "is missing, or not this session's", hint)]
         raise ApiProblem(403, "csrf", "Another site's page may have made this request.", faults)
     return Caller.of(session.key, session.expires_at)
+
+
+def count_failure(request: HTTPConnection) -> None:
+    """A key that was none, or a 429. Valid keys are not asked: many people may share an address, and one of them
+    who goes on trying must not lock the others out."""
+    rates: Rates = request.app.state.rates
+    drawn = rates.failures.take(neighbourhood(request.client.host if request.client else None))
+    if drawn is not None and drawn.wait_s:
+        raise _too_many("Too many keys from this address were not valid.", drawn)
+
+
+def _draw(rates: Rates, caller: Caller) -> Drawn | None:
+    """One request of the caller's. None where nothing is counted."""
+    drawn = None if caller.key_id is None else rates.keys.take(caller.key_id)
+    if drawn is not None and drawn.wait_s:
+        raise _too_many("This key asks more often than it may.", drawn)
+    return drawn
+
+
+def _too_many(detail: str, drawn: Drawn) -> ApiProblem:
+    wait_s = math.ceil(drawn.wait_s)
+    return ApiProblem(429, "too-many-requests", detail, retry_after_s=wait_s, headers=drawn.headers())
+
+
+def _adding(send: Send, headers: dict[str, str]) -> Send:
+    async def adding(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            MutableHeaders(scope=message).update(headers)
+        await send(message)
+
+    return adding
 
 
 def is_public(method: str, path: str) -> bool:

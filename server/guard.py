@@ -1,4 +1,4 @@
-"""Stands before every route: body limits, host and origin checks, security headers.
+"""Stands before every route: limits of size, host and origin checks, security headers.
 
 Where there are no keys, the one thing between a web page on the internet and this API is the browser; where
 there are, a browser may hold a session. So names that are not ours are refused (DNS rebinding), and so are
@@ -10,13 +10,11 @@ from __future__ import annotations
 import ipaddress
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.headers import add_to
+from server.limits import HEAD_BYTES, body_limit, head_bytes, limited
 from server.problems import response
-
-MIB = 1 << 20
 
 
 class Guard:
@@ -35,7 +33,11 @@ class Guard:
                 add_to(MutableHeaders(scope=message), scope["scheme"], scope["path"])
             await send(message)
 
-        if not self._is_ours(headers.get("host", "")):
+        head = head_bytes(scope.get("raw_path") or b"", scope["query_string"], scope["headers"])
+        if head > HEAD_BYTES:
+            detail = f"The request's head has {head} bytes; it may have at most {HEAD_BYTES}."
+            refusal = response(431, "head-too-large", detail)
+        elif not self._is_ours(headers.get("host", "")):
             refusal = response(
                 421, "misdirected-request", "This server does not go by that name; SPLATCT_ALLOWED_HOSTS lists its own."
             )
@@ -44,10 +46,10 @@ class Guard:
             "same-site",
         ):
             refusal = response(403, "cross-site", "Requests from other web sites are refused.")
-        elif (limit := _body_limit(scope)) is not None and _declared(headers) > limit:
+        elif (limit := body_limit(scope["method"], scope["path"])) is not None and _declared(headers) > limit:
             refusal = response(413, "content-too-large", f"The body may have at most {limit} bytes.")
         else:
-            await self.app(scope, receive if limit is None else _limited(receive, limit), send_guarded)
+            await self.app(scope, receive if limit is None else limited(receive, limit), send_guarded)
             return
         await refusal(scope, receive, send_guarded)
 
@@ -63,27 +65,6 @@ class Guard:
             return False
 
 
-def _body_limit(scope: Scope) -> int | None:
-    """Files are streamed and have the size they announced as their limit; all else is small."""
-    if scope["method"] in ("PUT", "PATCH") and scope["path"].startswith("/v1/uploads/"):
-        return None
-    return 16 * MIB if scope["path"] == "/v1/uploads" else MIB
-
-
 def _declared(headers: Headers) -> int:
     length = headers.get("content-length", "0")
     return int(length) if length.isdecimal() else 0
-
-
-def _limited(receive: Receive, limit: int) -> Receive:
-    seen = 0
-
-    async def counted() -> Message:
-        nonlocal seen
-        message = await receive()
-        seen += len(message.get("body", b""))
-        if seen > limit:
-            raise HTTPException(413)
-        return message
-
-    return counted

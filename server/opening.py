@@ -27,5 +27,6 @@ def opened(settings: Settings) -> Iterator[Database]:
 
 def make_ready(settings: Settings) -> None:
     """Raises, too, if others could reach a server that has no keys."""
+    settings.webhook_networks  # noqa: B018  raises for what is no network
     with opened(settings) as database:
         settings.require_door(KeyRing(database).exist())

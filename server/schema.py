@@ -174,6 +174,53 @@ class EventList(BaseModel):
     last: int = Field(description="number of the last event given; pass it as `after` next time")
 
 
+Event = Literal["job.succeeded", "job.failed", "job.cancelled"]
+
+
+class WebhookIn(Body):
+    url: Annotated[str, Field(min_length=1, max_length=2000)]
+    events: Annotated[set[Event], Field(min_length=1)] = {"job.succeeded", "job.failed", "job.cancelled"}
+
+
+class WebhookOut(BaseModel):
+    id: str
+    url: str
+    events: list[str]
+    created_at: datetime
+    secret: str | None = Field(description="what signatures are made with; told once, when the webhook is made")
+
+
+class WebhookList(BaseModel):
+    webhooks: list[WebhookOut]
+
+
+class DeliveryOut(BaseModel):
+    id: str = Field(description="the `webhook-id` of the message, the same in every attempt")
+    job_id: str
+    event: str
+    state: str = Field(description="waiting, delivered or given up")
+    attempts: int
+    status: int | None = Field(description="of the last answer")
+    error: str | None = Field(description="of the last attempt")
+    created_at: datetime
+    delivered_at: datetime | None
+    next_at: datetime | None
+
+
+class DeliveryList(BaseModel):
+    deliveries: list[DeliveryOut]
+
+
+class Taken(BaseModel):
+    used: int
+    limit: int | None = Field(description="null: none")
+
+
+class Usage(BaseModel):
+    bytes: Taken = Field(description="announced by open uploads, and of scans")
+    active_jobs: Taken = Field(description="queued or running")
+
+
 class Readiness(BaseModel):
     ready: bool
     database: bool

@@ -13,6 +13,7 @@ from server.access import Caller
 from server.census import Outcomes
 from server.intake import Intake
 from server.problems import not_found
+from server.quotas import Quotas
 from server.settings import Settings
 from server.store import Store
 from server.turns import Turns
@@ -28,6 +29,7 @@ class Service:
     intake: Intake
     watch: Watch
     outcomes: Outcomes
+    quotas: Quotas
     wake: Callable[[], None]  # have the reconcile loop look at once
     turns: Turns = field(default_factory=Turns)
     caller: Caller | None = None  # None: the server itself
@@ -35,6 +37,11 @@ class Service:
     def serving(self, caller: Caller) -> Service:
         """The same for one caller: its store finds nothing that is another tenant's."""
         return replace(self, store=self.store.of(caller.tenant), caller=caller)
+
+    @property
+    def tenant(self) -> str:
+        assert self.caller is not None, "the server itself has no quota"
+        return self.caller.tenant
 
     def folder(self, job_id: str) -> JobFolder:
         return JobFolder(self.settings.data, job_id)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 from fastapi import APIRouter, Request, Response
 
 from server.access import Caller
 from server.keys import KeyRing
 from server.problems import ApiProblem
+from server.rates import Rates, neighbourhood
 from server.schema import SessionIn, SessionOut, moment
 from server.service import Served
 from server.sessions import COOKIE, Sessions, csrf_token
@@ -21,10 +24,18 @@ def sign_in(body: SessionIn, request: Request, response: Response) -> SessionOut
     sessions: Sessions = request.app.state.sessions
     if not ring.exist():
         raise ApiProblem(409, "no-keys", "This server has no keys yet: there is nothing to sign in to.")
+    rates: Rates = request.app.state.rates
+    address = neighbourhood(request.client.host if request.client else None)
+    wait_s = math.ceil(rates.failures.wait_s(address))
+    if wait_s:  # before looking, so that trying on learns nothing
+        detail = "Too many keys from this address were not valid."
+        raise ApiProblem(429, "too-many-requests", detail, retry_after_s=wait_s)
     key = ring.find(body.key.strip())
     if key is None:
+        rates.failures.take(address)
         raise ApiProblem(401, "unauthorized", "This key is not known here, has expired or was revoked.")
     session, token = sessions.begin(key)
+    request.state.caller = caller = Caller.of(key, session.expires_at)
     response.set_cookie(
         COOKIE,
         token,
@@ -34,7 +45,7 @@ def sign_in(body: SessionIn, request: Request, response: Response) -> SessionOut
         httponly=True,
         samesite="strict",
     )
-    return _out(Caller.of(key, session.expires_at), csrf_token(token))
+    return _out(caller, csrf_token(token))
 
 
 @router.get("")

@@ -113,6 +113,13 @@ class NewJob:
     restart_of: str | None = None
 
 
+Permit = Callable[[sa.Connection], None]
+
+
+def _always(_write: sa.Connection) -> None:
+    """For who has no quota."""
+
+
 class Store:
     """Everything the server keeps, on one database.
 
@@ -134,7 +141,8 @@ class Store:
 
     # Uploads
 
-    def add_upload(self, name: str, announced: Sequence[File]) -> Upload:
+    def add_upload(self, name: str, announced: Sequence[File], permit: Permit = _always) -> Upload:
+        """`permit` may refuse by raising; it sees what there is, and what comes after it cannot change that."""
         upload_id, now = str(uuid4()), time.time()
         rows = [
             {
@@ -147,6 +155,7 @@ class Store:
             for n, f in enumerate(announced)
         ]
         with self.database.writing() as write:
+            permit(write)
             row = {"id": upload_id, "name": name, "committed": False, "created_at": now, "touched_at": now}
             write.execute(uploads.insert().values(**row, tenant=self.tenant or LOCAL_TENANT))
             write.execute(files.insert(), rows)
@@ -251,7 +260,7 @@ class Store:
 
     # Jobs
 
-    def add_job(self, job: NewJob, scan: Scan, place: Callable[[], None]) -> bool:
+    def add_job(self, job: NewJob, scan: Scan, place: Callable[[], None], permit: Permit = _always) -> bool:
         """Queue a job; False if the scan was deleted meanwhile. One transaction with `drop_scan`'s check.
 
         `place` puts the job's folder where it belongs, once id and claim are ours and before others see them.
@@ -261,6 +270,7 @@ class Store:
             mine = sa.and_(scans.c.id == scan.id, self._mine(scans))
             if write.execute(sa.select(scans.c.id).where(mine)).first() is None:
                 return False
+            permit(write)
             named = (scan.id, scan.name)
             self.jobs.add(write, job.id, job.name, named, job.options, job.priority, job.restart_of)
             if job.claim is not None:

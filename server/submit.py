@@ -82,7 +82,7 @@ def _queue(service: Service, scan: Scan, job: NewJob) -> None:
         made.create(service.intake.scan_folder(scan.id))
         if job.restart_of is not None:
             made.go_on_from(service.folder(job.restart_of))
-        queued = service.store.add_job(job, scan, lambda: made.become(folder))
+        queued = service.store.add_job(job, scan, lambda: made.become(folder), service.quotas.place_for(service.tenant))
     except FileNotFoundError:
         queued = False
     finally:

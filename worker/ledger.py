@@ -16,6 +16,7 @@ import sqlalchemy as sa
 
 from worker.contract import ACTIVE, FINISHED, LOCAL_TENANT, MAX_CRASHES, TRANSITIONS, ErrorKind, Priority, State
 from worker.database import Database, metadata
+from worker.outbox import announce
 
 _STATE = sa.Enum(State, native_enum=False, length=16, values_callable=lambda states: [s.value for s in states])
 
@@ -273,7 +274,18 @@ class Ledger:
             values = {"finished_at": time.time(), "eta_s": None, **values}
         expected = sa.and_(jobs.c.id == job_id, jobs.c.attempt == attempt, jobs.c.state == old)
         with self._database.writing() as write:
-            return write.execute(jobs.update().where(expected).values(state=new, **values)).rowcount == 1
+            moved = write.execute(jobs.update().where(expected).values(state=new, **values)).rowcount == 1
+            if moved and new in FINISHED:
+                job = _job(write.execute(sa.select(jobs).where(jobs.c.id == job_id)).one())
+                announce(write, job.tenant, f"job.{new}", _told(job))
+            return moved
+
+
+def _told(job: Job) -> dict[str, Any]:
+    """What webhooks hear of a job."""
+    error = None if job.error_kind is None else {"kind": job.error_kind, "message": job.error_message}
+    names = {"id": job.id, "name": job.name, "scan_id": job.scan_id, "scan_name": job.scan_name}
+    return {**names, "state": job.state, "error": error}
 
 
 def _place() -> sa.ColumnElement[int]:

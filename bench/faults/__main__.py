@@ -1,6 +1,6 @@
 """Kill everything, again and again, and count what was lost.
 
-    python -m bench.faults            100 SIGKILLs of worker or engine, 20 of the server, 20 of Redis, 10 wipes and drains
+    python -m bench.faults            100 SIGKILLs of worker or engine, 20 of server and Redis, 10 wipes, 10 drains
     python -m bench.faults --quick    a tenth of it
 
 Real parts on loopback, in a temporary folder. Writes faults.md and faults.json; exits 1 if a job was lost, published

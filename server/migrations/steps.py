@@ -6,11 +6,20 @@ from collections.abc import Callable
 
 import sqlalchemy as sa
 
-from server.migrations import v0001_first, v0002_tenants, v0003_sessions, v0004_durable_jobs
+from server.migrations import (
+    v0001_first,
+    v0002_tenants,
+    v0003_sessions,
+    v0004_audit,
+    v0005_webhooks,
+    v0006_durable_jobs,
+)
 
 STEPS: tuple[Callable[[sa.Connection], None], ...] = (
     v0001_first.upgrade,
     v0002_tenants.upgrade,
     v0003_sessions.upgrade,
-    v0004_durable_jobs.upgrade,
+    v0004_audit.upgrade,
+    v0005_webhooks.upgrade,
+    v0006_durable_jobs.upgrade,
 )

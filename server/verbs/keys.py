@@ -40,6 +40,7 @@ def add_data_option(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     import os
 
+    from server.audit import COMMAND_LINE, AuditLog, Deed
     from server.keys import KeyRing, Scope
     from server.opening import opened
     from server.settings import Settings, SettingsError
@@ -50,10 +51,11 @@ def run(args: argparse.Namespace) -> int:
     if args.action != "add":
         settings.require_database()
     with opened(settings) as database:
-        ring = KeyRing(database)
+        ring, audit = KeyRing(database), AuditLog(database)
         if args.action == "add":
             scopes = _scopes(args.scopes)
             key, text = ring.add(_tenant(args.tenant), args.name, map(Scope, scopes), expiry(args.expires))
+            audit.note(Deed(key.tenant, None, COMMAND_LINE, "add-key", key.id, " ".join(sorted(key.scopes))))
             _print(args, {"key": text, **described(key)}, text)
             if not args.json:
                 _advise(key)
@@ -64,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
             revoked = ring.revoke(args.id)
             if revoked is None:
                 raise SettingsError(f"keys revoke: got {args.id!r}, expected the id of a key; see `splatct keys list`")
+            audit.note(Deed(revoked.tenant, None, COMMAND_LINE, "revoke-key", revoked.id))
             _print(args, described(revoked), f"key {revoked.id} of {revoked.tenant} is revoked")
     return 0
 

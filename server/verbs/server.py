@@ -29,6 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from server.app import create_app
     from server.opening import make_ready
     from server.settings import Settings
+    from server.wire import BoundedHead
     from worker.lifeline import die_with_parent
 
     if args.tie_to is not None:
@@ -52,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
 
     config = uvicorn.Config(
         app,
+        http=BoundedHead,
         host=settings.host,
         port=settings.port,
         log_config=None,

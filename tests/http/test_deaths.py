@@ -9,8 +9,11 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from redis import Redis
+
+from splatcore.simulate import Simulation, simulate
 
 from .stack import Stack, commit, kill, scan_files, submit
 
@@ -87,6 +90,35 @@ def test_no_more_than_one_checkpoint_of_work_is_lost(stack: Stack) -> None:
     assert ran[2][-1] == 119
     events = stack.http.get(f"/v1/jobs/{job_id}/events").json()["events"]
     assert sum("Going on from the checkpoint" in event["message"] for event in events) == 2
+
+
+@pytest.mark.slow
+def test_the_real_engine_killed_twice_gives_the_bits_of_one_that_was_not(stack: Stack) -> None:
+    z, y, x = np.mgrid[-1:1:24j, -1:1:24j, -1:1:24j]
+    body = 0.5 * (x**2 + (y / 0.7) ** 2 + z**2 < 0.6) + 0.4 * (abs(x + 0.3) + abs(y) + abs(z) < 0.25)
+    folder = stack.data.parent / "real"
+    simulate(body.astype(np.float32), folder, Simulation(views=16, det=48, sigma_rot=0.02, seed=1), 1, name="real")
+    scan_id = commit(
+        stack.http, {file.name: file.read_bytes() for file in folder.iterdir() if file.name != "truth.tif"}
+    )
+    stack.environment |= {"SPLATCT_ENGINE": "splatcore", "SPLATCT_TEST_MODE": "1", "SPLATCT_TEST_STEP_S": "0.002"}
+    worker = stack.start_worker()
+    options = {"quality": "preview", "splats": 1500, "threads": 1}
+    plain = stack.wait(submit(stack.http, scan_id, **options), "succeeded", "failed", seconds=120)
+    job_id = submit(stack.http, scan_id, **options)
+    for attempt, share in ((1, 0.3), (2, 0.6)):
+        stack.until(lambda share=share: stack.job(job_id)["progress"] > share, 60, f"{share} of attempt {attempt}")  # type: ignore[misc]
+        if attempt == 1:
+            os.kill(stack.engine_pids()[0], signal.SIGKILL)
+        else:
+            kill(worker)
+            stack.start_worker()
+        stack.until(lambda attempt=attempt: stack.job(job_id)["attempt"] > attempt, 20, "another attempt")  # type: ignore[misc]
+    done = stack.wait(job_id, "succeeded", "failed", seconds=120)
+    assert (plain["state"], done["state"], done["attempt"]) == ("succeeded", "succeeded", 3)
+    for name in ("volume.tif", "splats.npz", "report.json"):
+        got = [stack.http.get(f"/v1/jobs/{job['id']}/results/{name}").content for job in (plain, done)]
+        assert got[0] == got[1], name
 
 
 def test_a_drained_worker_loses_no_work(stack: Stack) -> None:

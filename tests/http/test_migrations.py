@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 
-import server.store  # noqa: F401  the tables
+import server.app  # noqa: F401  all tables
 from server.migrations import SchemaError, prepare, runner, v0001_first
 from server.migrations.steps import STEPS
 from worker.database import Database, metadata

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from server.opening import make_ready
 from server.settings import Settings, SettingsError
 
 
@@ -43,6 +44,21 @@ def test_beyond_loopback_a_server_needs_a_name(host: str) -> None:
     named = Settings(host=host, allowed_hosts=" CT.example.org,, [fd00::5] ")
     named.require_door(keys_exist=True)
     assert named.host_names == {"ct.example.org", "fd00::5"}
+
+
+def test_a_server_that_goes_by_a_name_needs_keys_even_on_loopback() -> None:
+    """Else a proxy before it, or a page that rebinds the name, would let everybody in."""
+    settings = Settings(allowed_hosts="ct.example.org")
+    assert not settings.may_be_open and Settings().may_be_open
+    settings.require_door(keys_exist=True)
+    with pytest.raises(SettingsError, match=r"allowed_hosts .*got 'ct.example.org'.*there are no keys"):
+        settings.require_door(keys_exist=False)
+
+
+def test_a_network_that_is_none_is_refused_before_anything_listens() -> None:
+    assert len(Settings(webhook_allow=" 10.1.0.0/16, fd00::/8,").webhook_networks) == 2
+    with pytest.raises(SettingsError, match=r"SPLATCT_WEBHOOK_ALLOW\): got '10.1.0.1/16'"):
+        make_ready(Settings(webhook_allow="10.1.0.1/16"))
 
 
 def test_an_address_that_is_listened_on_is_a_name() -> None:

@@ -20,7 +20,8 @@ from .stack import Stack, announce, commit, scan_files, submit
 NO_IDS = {  # nothing in the request names a thing; what they list is tested below
     "GET /", "GET /healthz", "GET /readyz", "GET /metrics", "GET /openapi.json", "HEAD /openapi.json",
     "GET /v1/options", "GET /v1/jobs", "GET /v1/scans", "POST /v1/uploads", "OPTIONS /v1/uploads",
-    "GET /sign-in", "POST /v1/session", "GET /v1/session", "DELETE /v1/session",
+    "GET /sign-in", "GET /v1/usage", "GET /v1/webhooks", "POST /v1/webhooks",
+    "POST /v1/session", "GET /v1/session", "DELETE /v1/session",
     "GET /jobs/{job_id}",  # a shell that is the same for every id
     "OPTIONS /v1/uploads/{upload_id}/files/{name}",  # what the server can do, the same for every id
 }  # fmt: skip
@@ -45,6 +46,9 @@ FOREIGN = [
     "GET /v1/jobs/{job_id}/report",
     "GET /v1/jobs/{job_id}/results/{file}",
     "GET /v1/jobs/{job_id}/slices/{axis}/{index}.png",
+    "GET /v1/webhooks/{webhook_id}",
+    "GET /v1/webhooks/{webhook_id}/deliveries",
+    "DELETE /v1/webhooks/{webhook_id}",
 ]
 IN_BODY = {"POST /v1/jobs"}
 
@@ -58,13 +62,17 @@ class Two:
     upload_id: str
     scan_id: str
     job_id: str
+    webhook_id: str
     own_scan_id: str  # of the second
 
-    def ask(self, http: httpx.Client, call: str, upload_id: str, scan_id: str, job_id: str) -> httpx.Response:
+    @property
+    def ids(self) -> dict[str, str]:
+        names = ("upload_id", "scan_id", "job_id", "webhook_id")
+        return {name: getattr(self, name) for name in names}
+
+    def ask(self, http: httpx.Client, call: str, ids: dict[str, str]) -> httpx.Response:
         method, path = call.split()
-        url = path.format(
-            upload_id=upload_id, scan_id=scan_id, job_id=job_id, name="scan.json", file="volume.tif", axis="z", index=0
-        )
+        url = path.format(**ids, name="scan.json", file="volume.tif", axis="z", index=0)
         more: dict[str, Any] = {}
         if method == "PUT" and "uploads" in path:
             more["content"] = b"x"
@@ -85,7 +93,8 @@ def two(keyed: Stack) -> Iterator[Two]:
         upload_id = announce(keyed.http, scan_files())["id"]
         job_id = submit(keyed.http, scan_id)
         keyed.wait(job_id, "succeeded")
-        yield Two(keyed.http, second, upload_id, scan_id, job_id, commit(second, scan_files()))
+        webhook_id = keyed.http.post("/v1/webhooks", json={"url": "https://lab.example.org/done"}).json()["id"]
+        yield Two(keyed.http, second, upload_id, scan_id, job_id, webhook_id, commit(second, scan_files()))
 
 
 def test_no_route_is_left_out() -> None:
@@ -101,20 +110,20 @@ def test_no_route_is_left_out() -> None:
 
 @pytest.mark.parametrize("call", FOREIGN)
 def test_a_foreign_id_is_not_there(two: Two, call: str) -> None:
-    foreign = two.ask(two.second, call, two.upload_id, two.scan_id, two.job_id)
+    foreign = two.ask(two.second, call, two.ids)
     assert foreign.status_code == 404, foreign.text
     if call != "PUT /v1/jobs/{job_id}":  # where an id that nobody has makes a job
-        nobody = two.ask(two.second, call, *(str(uuid4()) for _ in range(3)))
+        nobody = two.ask(two.second, call, dict.fromkeys(two.ids, str(uuid4())))
         assert (nobody.status_code, nobody.content) == (404, foreign.content), "no word betrays that there is one"
     if call.startswith("GET"):
-        assert two.ask(two.first, call, two.upload_id, two.scan_id, two.job_id).status_code == 200, "its owner sees it"
+        assert two.ask(two.first, call, two.ids).status_code == 200, "its owner sees it"
 
 
 def test_what_was_asked_for_is_still_whole(two: Two) -> None:
     """Of all the deletions and cancellations above, none did anything."""
     for call in FOREIGN:
         if not call.startswith("GET"):
-            two.ask(two.second, call, two.upload_id, two.scan_id, two.job_id)
+            two.ask(two.second, call, two.ids)
     assert two.first.get(f"/v1/uploads/{two.upload_id}").json()["state"] == "open"
     assert two.first.get(f"/v1/scans/{two.scan_id}").status_code == 200
     assert two.first.get(f"/v1/jobs/{two.job_id}/results/volume.tif").status_code == 200

@@ -10,6 +10,8 @@ import pytest
 from sqlalchemy.exc import IntegrityError
 
 from server.migrations import prepare
+from server.problems import ApiProblem
+from server.quotas import Quotas
 from server.store import File, NewJob, Store
 from server.submissions import Claim, Kind
 from worker.contract import State
@@ -74,3 +76,36 @@ def test_of_submissions_at_once_one_makes_the_job(database: Database, kind: Kind
             assert sum(pool.map(submit, range(6))) == 1
         assert len(placed) == 1 and len(store.jobs.in_states(State)) == turn + 1
     store.submissions.purge()
+
+
+def test_of_uploads_at_once_no_more_than_fit_the_quota_are_taken(database: Database) -> None:
+    quotas, together = Quotas(35, 2), threading.Barrier(6)
+    stores = {tenant: Store(database, tenant) for tenant in ("a", "b")}
+
+    def announce(number: int) -> bool:
+        tenant = "ab"[number % 2]
+        together.wait()
+        try:
+            stores[tenant].add_upload("scan", [File("scan.json", 10, None, None)], quotas.room_for(tenant, 10))
+        except ApiProblem:
+            return False
+        return True
+
+    with ThreadPoolExecutor(6) as pool:
+        taken = [number % 2 for _ in range(4) for number, done in enumerate(pool.map(announce, range(6))) if done]
+    assert (taken.count(0), taken.count(1)) == (3, 3)
+
+
+def test_of_jobs_at_once_no_more_than_the_quota_are_queued(database: Database) -> None:
+    quotas, together, store = Quotas(0, 2), threading.Barrier(6), Store(database, "a")
+    scan = store.commit(store.add_upload("scan", [File("scan.json", 1, None, None)]), {})
+
+    def submit(number: int) -> bool:
+        together.wait()
+        try:
+            return store.add_job(NewJob(str(number), "job", {}), scan, lambda: None, quotas.place_for("a"))
+        except ApiProblem:
+            return False
+
+    with ThreadPoolExecutor(6) as pool:
+        assert sum(pool.map(submit, range(6))) == 2

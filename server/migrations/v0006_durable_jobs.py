@@ -1,4 +1,4 @@
-"""Version 4: jobs have a priority, may be made from earlier ones, and may end with a partial result."""
+"""Version 6: jobs have a priority, may be made from earlier ones, and may end with a partial result."""
 
 from __future__ import annotations
 
