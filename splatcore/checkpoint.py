@@ -19,16 +19,12 @@ from numpy.typing import NDArray
 
 import splatcore
 from splatcore.durable import renamed
-from splatcore.errors import SplatCTError
+from splatcore.errors import CheckpointError
 from splatcore.frozen import Arrays, freeze, thaw
 from splatcore.options import Options
 from splatcore.scan import Scan
 
 FORMAT, VERSION = "splatct-checkpoint", 1
-
-
-class CheckpointError(SplatCTError):
-    """A checkpoint cannot be gone on from; its text says why, as the end of a sentence."""
 
 
 def identity(scan: Scan, options: Options) -> dict[str, Any]:

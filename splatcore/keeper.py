@@ -17,9 +17,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from splatcore import checkpoint
-from splatcore.checkpoint import CheckpointError
-from splatcore.errors import SplatCTError
+from splatcore.errors import CheckpointError, SplatCTError
 
 EVERY_S = 10.0
 FILE = "run.checkpoint"
@@ -67,6 +65,8 @@ class Keeper:
         that does not help; no state and nothing where there was none. From here on states are kept as `about`'s."""
         if self.file is None:
             return None, ""
+        from splatcore import checkpoint
+
         self._about = about()
         try:
             state = checkpoint.read(self.file, self._about, kinds)
@@ -97,6 +97,8 @@ class Keeper:
             self.file.unlink(missing_ok=True)
 
     def _write(self, file: Path, state: Callable[[], State]) -> None:
+        from splatcore import checkpoint  # not above: who only sets a wish need not wait for numpy
+
         began = self._clock()
         try:
             checkpoint.write(file, self._about, state())

@@ -37,12 +37,15 @@ FOREIGN = [
     "DELETE /v1/scans/{scan_id}",
     "PUT /v1/jobs/{job_id}",
     "GET /v1/jobs/{job_id}",
+    "POST /v1/jobs/{job_id}/restart",
     "POST /v1/jobs/{job_id}/cancel",
     "DELETE /v1/jobs/{job_id}",
     "GET /v1/jobs/{job_id}/events",
     "GET /v1/jobs/{job_id}/events/stream",
     "GET /v1/jobs/{job_id}/log",
     "GET /v1/jobs/{job_id}/results",
+    "GET /v1/jobs/{job_id}/partial",
+    "GET /v1/jobs/{job_id}/partial/{file}",
     "GET /v1/jobs/{job_id}/report",
     "GET /v1/jobs/{job_id}/results/{file}",
     "GET /v1/jobs/{job_id}/slices/{axis}/{index}.png",
@@ -50,7 +53,7 @@ FOREIGN = [
     "GET /v1/webhooks/{webhook_id}/deliveries",
     "DELETE /v1/webhooks/{webhook_id}",
 ]
-IN_BODY = {"POST /v1/jobs"}
+IN_BODY = {"POST /v1/jobs", "POST /v1/jobs/validate"}
 
 
 @dataclass
@@ -81,7 +84,9 @@ class Two:
                 "content": b"x",
                 "headers": {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"},
             }
-        if method in ("POST", "PUT") and "/jobs" in path and "cancel" not in path:
+        if path.endswith("/restart"):
+            more["json"] = {}
+        elif method in ("POST", "PUT") and "/jobs" in path and "cancel" not in path:
             more["json"] = {"scan_id": self.own_scan_id}
         return http.request(method, url, **more)
 
@@ -116,7 +121,8 @@ def test_a_foreign_id_is_not_there(two: Two, call: str) -> None:
         nobody = two.ask(two.second, call, dict.fromkeys(two.ids, str(uuid4())))
         assert (nobody.status_code, nobody.content) == (404, foreign.content), "no word betrays that there is one"
     if call.startswith("GET"):
-        assert two.ask(two.first, call, two.ids).status_code == 200, "its owner sees it"
+        none = 409 if "/partial" in call else 200  # it succeeded, so there is nothing partial
+        assert two.ask(two.first, call, two.ids).status_code == none, "its owner sees it"
 
 
 def test_what_was_asked_for_is_still_whole(two: Two) -> None:
@@ -131,8 +137,9 @@ def test_what_was_asked_for_is_still_whole(two: Two) -> None:
     assert [file["received"] for file in files] == [0, 0]
 
 
-def test_a_foreign_scan_cannot_be_reconstructed(two: Two) -> None:
-    answers = [two.second.post("/v1/jobs", json={"scan_id": scan}) for scan in (two.scan_id, str(uuid4()))]
+@pytest.mark.parametrize("path", ["/v1/jobs", "/v1/jobs/validate"])
+def test_a_foreign_scan_cannot_be_reconstructed(two: Two, path: str) -> None:
+    answers = [two.second.post(path, json={"scan_id": scan}) for scan in (two.scan_id, str(uuid4()))]
     assert [answer.status_code for answer in answers] == [422, 422] and answers[0].content == answers[1].content
 
 
