@@ -35,7 +35,8 @@ function show(job) {
 }
 
 function showStages(stage) {
-  const now = STAGES.findIndex(([name]) => name === (stage === "poses" ? "level" : stage)); // the two take turns
+  const shown = ["poses", "refine", "checkpoint"].includes(stage) ? "level" : stage; // they take turns, or tell of it
+  const now = STAGES.findIndex(([name]) => name === shown);
   const nodes = STAGES.map(([, text], index) =>
     el("li", { class: index < now ? "past" : index === now ? "now" : "ahead", "aria-current": index === now ? "step" : null }, text),
   );

@@ -68,6 +68,15 @@ class Stage:
         folder.publish(1)
         assert self.ledger.succeed(job_id, 1)
 
+    def end_early(self, job_id: str) -> None:
+        """Cancelled, with what it had."""
+        assert self.ledger.ask_cancel(job_id)
+        folder = JobFolder(self.data, job_id)
+        folder.attempt(1).mkdir()
+        write_results(folder.attempt(1), REPORT)
+        assert folder.publish_partial(1)
+        assert self.ledger.end_cancel(job_id, 1, partial=True)
+
 
 REPORT = {
     "verdict": "The scan is usable. Its centre of rotation was 2.3 pixels off and has been corrected.",

@@ -6,6 +6,8 @@ import hashlib
 import itertools
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -143,6 +145,11 @@ def test_what_a_cancelled_job_had_can_be_fetched(stack: Stack) -> None:
     for file in manifest["files"]:
         got = stack.http.get(f"/v1/jobs/{job_id}/partial/{file['name']}").raise_for_status().content
         assert hashlib.sha256(got).hexdigest() == file["sha256"]
+    command = [sys.executable, "-m", "splatct_client", "fetch", job_id, "--server", str(stack.http.base_url)]
+    for more, code in ([], 1), (["--partial"], 0):
+        out = ["-o", str(stack.data.parent / "fetched")]
+        assert subprocess.run([*command, *more, *out], capture_output=True, check=False).returncode == code
+    assert (stack.data.parent / "fetched" / "manifest.json").exists()
     assert stack.http.get(f"/v1/jobs/{job_id}/slices/z/2.png").headers["content-type"] == "image/png"
     assert stack.http.get(job["links"]["report"]).status_code == 200
 
