@@ -75,10 +75,14 @@ def cancel_job(job_id: UUID, service: Served, response: Response) -> JobOut:
 
 @router.post("/jobs/{job_id}/restart", status_code=202)
 def restart_job(
-    job_id: UUID, body: RestartIn, service: Served, response: Response, idempotency_key: IdempotencyKey = None
+    job_id: UUID,
+    service: Served,
+    response: Response,
+    body: RestartIn | None = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> JobOut:
     """A new job from a finished one, with some options changed; unchanged, it goes on from where that was ended."""
-    return _submitted(service, response, *restart(service, service.job(job_id), body, idempotency_key))
+    return _submitted(service, response, *restart(service, service.job(job_id), body or RestartIn(), idempotency_key))
 
 
 @router.delete("/jobs/{job_id}", status_code=204)

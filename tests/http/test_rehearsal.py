@@ -23,7 +23,9 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Stack]]:
 
     def begin(**given: str) -> Stack:
         stack = Stack(tmp_path)
-        stack.environment |= {"SPLATCT_TEST_MODE": "1"} | {f"SPLATCT_TEST_{k.upper()}": v for k, v in given.items()}
+        stack.environment |= {"SPLATCT_CHECKPOINT_S": "0", "SPLATCT_TEST_MODE": "1"} | {
+            f"SPLATCT_TEST_{k.upper()}": v for k, v in given.items()
+        }
         running.append(stack.__enter__())
         stack.start_worker()
         return stack
