@@ -59,6 +59,7 @@ class Keeper:
         self.seconds = 0.0  # spent on writing them
         self._about: dict[str, Any] = {}
         self._last, self._gap = clock(), every_s
+        self._still = False  # no step has been made since the state that the run went on from
 
     def recall(self, about: Callable[[], dict[str, Any]], kinds: Iterable[type]) -> tuple[State | None, str]:
         """The state of an earlier run of the same, and a sentence about it; no state and why, where there was a file
@@ -74,6 +75,7 @@ class Keeper:
             return None, ""
         except CheckpointError as error:
             return None, f"The checkpoint is not used, {error}; starting from the beginning"
+        self._still = True
         return state, "Going on from the checkpoint"
 
     def pause(self, state: Callable[[], State], stage_ends: bool = False) -> None:
@@ -82,7 +84,9 @@ class Keeper:
         Raises Stopped or Concluding if that is wished."""
         stop = self.wish is Wish.STOP
         gap = self._gap * (_EARLY if stage_ends else 1)
-        if self.file is not None and (stop or self._clock() - self._last >= gap):
+        # What stands in the file already is not written anew: a newer file means that the run got further.
+        due, self._still = not self._still and self._clock() - self._last >= gap, False
+        if self.file is not None and (stop or due):
             self._write(self.file, state)
         if stop:
             kept = f"its state is in {self.file}" if self.file and not self.trouble else "its state is not kept"

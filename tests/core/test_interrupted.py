@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from splatcore.checkpoint import identity
 from splatcore.keeper import Keeper, Stopped, Wish
 from splatcore.options import Options
 from splatcore.progress import Progress
-from splatcore.reconstruct import drain, reconstruct
+from splatcore.reconstruct import _KINDS, drain, reconstruct, resolved
 from splatcore.reconstruction import Reconstruction
 from splatcore.results import write_results
 from splatcore.scan import Scan
@@ -132,6 +133,25 @@ def resumed(scan: Scan, file: Path, **changes: Any) -> str:
 
 def test_going_on_is_said(scan: Scan, kept: Path) -> None:
     assert resumed(scan, kept).startswith("Going on from the checkpoint")
+
+
+def test_a_newer_file_means_that_the_run_got_further(scan: Scan, kept: Path) -> None:
+    """By that a service tells a job which dies at one place from one that is being killed."""
+    before = kept.stat().st_ino
+    keeper = Keeper(kept, every_s=0.0)
+    states: list[int] = []
+
+    class Dead(Exception):
+        pass
+
+    def die() -> dict[str, Any]:
+        raise Dead
+
+    assert keeper.recall(lambda: identity(scan, resolved(scan, PREVIEW)), _KINDS)[0] is not None
+    keeper.pause(die)  # due, but nothing has been done since
+    assert kept.stat().st_ino == before
+    keeper.pause(lambda: {"step": states.append(1) or 1})
+    assert states and kept.stat().st_ino != before
 
 
 def test_other_options_start_afresh_and_say_which(scan: Scan, kept: Path) -> None:
