@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -11,19 +12,46 @@ from typing import Any
 from fastapi import FastAPI, Response
 from fastapi.staticfiles import StaticFiles
 
-from server import follow, health, janitor, jobs, metrics, pages, problems, results, resume, scans, uploads
+from server import (
+    follow,
+    health,
+    janitor,
+    jobs,
+    metrics,
+    pages,
+    problems,
+    results,
+    resume,
+    scans,
+    signin,
+    uploads,
+    usage,
+    webhooks,
+)
+from server.access import Access
+from server.audit import AuditLog
 from server.census import Census, Outcomes
+from server.deliveries import Outbox, keep_delivering
 from server.dispatch import Dispatcher
 from server.guard import Guard
 from server.intake import Intake
+from server.keys import KeyRing
 from server.metrics import JobNumbers, Metrics
+from server.migrations import prepare
 from server.observe import Observer
+from server.quotas import Quotas
+from server.rates import Buckets, Rates
 from server.reconcile import Reconciler, keep_reconciling
+from server.rehearsal import DropUploads
 from server.service import Service
+from server.sessions import Sessions
 from server.settings import Settings
 from server.store import Store
 from server.watch import Watch
+from server.witness import Witness
 from worker.database import Database
+
+log = logging.getLogger("splatct.server")
 
 
 class _Static(StaticFiles):
@@ -43,24 +71,33 @@ def create_app(settings: Settings) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         (settings.data / "jobs").mkdir(parents=True, exist_ok=True)
         database = Database(settings.database)
-        database.create_tables()
+        prepare(database)
         store, intake = Store(database), Intake(settings.data)
         dispatcher = Dispatcher(settings.redis_url)
         watch = Watch(store.jobs, settings.data)
         reconciler = Reconciler(store.jobs, dispatcher, settings.data)
-        outcomes = Outcomes(database)
+        outcomes, outbox = Outcomes(database), Outbox(database, settings.webhook_retry_s)
+        quotas = Quotas(round(settings.tenant_gib * (1 << 30)), settings.tenant_jobs)
         loop, wake = asyncio.get_running_loop(), asyncio.Event()
 
         def wake_up() -> None:
             loop.call_soon_threadsafe(wake.set)
 
-        app.state.service = Service(settings, store, intake, watch, outcomes, wake_up)
+        app.state.service = Service(settings, store, intake, watch, outcomes, quotas, wake_up)
         app.state.metrics = Metrics(JobNumbers(Census(database), outcomes, reconciler, settings.data))
         app.state.dispatcher = dispatcher
+        app.state.audit = AuditLog(database)
+        app.state.rates = Rates(
+            Buckets(settings.rate_per_s, settings.rate_burst),
+            Buckets(settings.failures_per_min / 60, max(1, round(settings.failures_per_min))),
+        )
+        app.state.keys = KeyRing(database)
+        app.state.sessions = Sessions(database, app.state.keys, round(settings.session_hours * 3600))
         tasks = [
             asyncio.create_task(keep_reconciling(reconciler, settings.reconcile_s, wake)),
             asyncio.create_task(watch.keep_looking()),
             asyncio.create_task(janitor.keep_clean(store, intake, settings.data, settings.stale_upload_hours * 3600.0)),
+            asyncio.create_task(keep_delivering(outbox, settings.webhook_networks)),
         ]
         try:
             yield
@@ -80,9 +117,14 @@ def create_app(settings: Settings) -> FastAPI:
         separate_input_output_schemas=False,
     )
     problems.install(app)
-    app.add_middleware(Guard)
+    if settings.test_mode:
+        log.warning("test mode is on: jobs and uploads may fail on purpose")
+        app.add_middleware(DropUploads, share=settings.test_drop_uploads)
+    app.add_middleware(Witness)
+    app.add_middleware(Access, open_without_keys=settings.may_be_open)
+    app.add_middleware(Guard, allowed_hosts=settings.host_names)
     app.add_middleware(Observer)
-    for part in (uploads, resume, scans, jobs, follow, results, health, metrics):
+    for part in (signin, uploads, resume, scans, jobs, follow, results, health, metrics, usage, webhooks):
         app.include_router(part.router)
     app.include_router(pages.router)
     app.mount("/static", _Static(directory=Path(__file__).parent / "static"), name="static")

@@ -21,6 +21,7 @@ from worker.ledger import Job
 
 __all__ = ["Dispatcher", "RedisError"]
 
+MOST_WAITING = 200  # on the queue: each is a sign that wakes a worker, which asks the database whose turn it is
 PICK_UP_S = 6.0  # how long a job may be off the queue without its row saying that it runs
 WORKER_SILENCE_S = 40.0  # an idle worker shows itself every 15 s, a busy one every 5 s
 RESULT_TTL_S = 60
@@ -36,7 +37,7 @@ class Dispatcher:
         self._off_since: dict[str, float] = {}
 
     def ensure_queued(self, jobs: Sequence[Job]) -> None:
-        """Put every job on the queue that is not there, oldest first.
+        """Put every job on the queue that is not there, oldest first, up to as many as are of use.
 
         A job just taken by a worker is for a moment neither on the queue nor running; it is left
         alone for that moment. Putting one there twice is harmless: only one claim succeeds.
@@ -44,7 +45,7 @@ class Dispatcher:
         waiting = set(self._queue.get_job_ids())
         now = time.monotonic()
         off: dict[str, float] = {}
-        for job in jobs:
+        for job in jobs[:MOST_WAITING]:
             name = queue_id(job.id, job.attempt)
             if name in waiting:
                 continue
@@ -61,7 +62,6 @@ class Dispatcher:
                 result_ttl=RESULT_TTL_S,
                 failure_ttl=FAILURE_TTL_S,
                 description=name,
-                at_front=job.attempt > 1,
             )
         self._off_since = off
 

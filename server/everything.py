@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from server.children import Child, stop_all
+from server.opening import make_ready
 from server.redisserver import OwnRedis, RedisUnavailable
 from server.settings import Settings, SettingsError
 
@@ -24,16 +25,13 @@ STOP_S = 15.0
 
 def run_everything(settings: Settings, workers: int, has_redis: bool, ready: Callable[[str], None]) -> int:
     """Run until SIGINT or SIGTERM. `ready` is called once, with the URL, when the server answers."""
-    settings.require_loopback()
     if workers < 1:
         raise SettingsError(f"workers: got {workers}, expected 1 or more")
     settings = settings.model_copy(update={"port": _free_port(settings.host, settings.port)})
     stop = threading.Event()
     for which in (signal.SIGINT, signal.SIGTERM):
         signal.signal(which, lambda *_: stop.set())
-    if settings.data.exists() and not settings.data.is_dir():
-        raise SettingsError(f"data: {settings.data} is a file, expected a folder; choose another with --data")
-    settings.data.mkdir(parents=True, exist_ok=True)
+    make_ready(settings)
     with _only_one(settings.data), contextlib.ExitStack() as cleanup:
         redis = None
         if not has_redis:

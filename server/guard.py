@@ -1,8 +1,8 @@
-"""Stands before every route: body limits, host and origin checks, security headers.
+"""Stands before every route: limits of size, host and origin checks, security headers.
 
-There are no keys yet, so the one thing between a web page on the internet and this API is the
-browser. Names other than loopback ones are refused (DNS rebinding), and so are writes that a browser
-marks as coming from another site.
+Where there are no keys, the one thing between a web page on the internet and this API is the browser; where
+there are, a browser may hold a session. So names that are not ours are refused (DNS rebinding), and so are
+writes that a browser marks as coming from another site.
 """
 
 from __future__ import annotations
@@ -10,25 +10,17 @@ from __future__ import annotations
 import ipaddress
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.headers import add_to
+from server.limits import HEAD_BYTES, body_limit, head_bytes, limited
 from server.problems import response
-
-MIB = 1 << 20
-_HEADERS = {
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
-    "object-src 'none'; base-uri 'none'; frame-ancestors 'none'; form-action 'self'",
-}
 
 
 class Guard:
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, allowed_hosts: frozenset[str]) -> None:
         self.app = app
+        self._allowed_hosts = allowed_hosts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -38,56 +30,41 @@ class Guard:
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                for name, value in _HEADERS.items():
-                    MutableHeaders(scope=message).setdefault(name, value)
+                add_to(MutableHeaders(scope=message), scope["scheme"], scope["path"])
             await send(message)
 
-        if not _is_local(headers.get("host", "")):
-            refusal = response(421, "misdirected-request", "This server answers to its loopback name only.")
+        head = head_bytes(scope.get("raw_path") or b"", scope["query_string"], scope["headers"])
+        if head > HEAD_BYTES:
+            detail = f"The request's head has {head} bytes; it may have at most {HEAD_BYTES}."
+            refusal = response(431, "head-too-large", detail)
+        elif not self._is_ours(headers.get("host", "")):
+            refusal = response(
+                421, "misdirected-request", "This server does not go by that name; SPLATCT_ALLOWED_HOSTS lists its own."
+            )
         elif scope["method"] not in ("GET", "HEAD", "OPTIONS") and headers.get("sec-fetch-site") in (
             "cross-site",
             "same-site",
         ):
             refusal = response(403, "cross-site", "Requests from other web sites are refused.")
-        elif (limit := _body_limit(scope)) is not None and _declared(headers) > limit:
+        elif (limit := body_limit(scope["method"], scope["path"])) is not None and _declared(headers) > limit:
             refusal = response(413, "content-too-large", f"The body may have at most {limit} bytes.")
         else:
-            await self.app(scope, receive if limit is None else _limited(receive, limit), send_guarded)
+            await self.app(scope, receive if limit is None else limited(receive, limit), send_guarded)
             return
         await refusal(scope, receive, send_guarded)
 
-
-def _body_limit(scope: Scope) -> int | None:
-    """Files are streamed and have the size they announced as their limit; all else is small."""
-    if scope["method"] in ("PUT", "PATCH") and scope["path"].startswith("/v1/uploads/"):
-        return None
-    return 16 * MIB if scope["path"] == "/v1/uploads" else MIB
+    def _is_ours(self, host: str) -> bool:
+        """Whether a Host header names this machine: by a loopback name, or one that the settings allow."""
+        name, colon, port = host.rpartition(":")
+        name = (name if colon and port.isdecimal() else host).strip("[]").lower()
+        if name in self._allowed_hosts:
+            return True
+        try:
+            return name == "localhost" or ipaddress.ip_address(name).is_loopback
+        except ValueError:
+            return False
 
 
 def _declared(headers: Headers) -> int:
     length = headers.get("content-length", "0")
     return int(length) if length.isdecimal() else 0
-
-
-def _limited(receive: Receive, limit: int) -> Receive:
-    seen = 0
-
-    async def counted() -> Message:
-        nonlocal seen
-        message = await receive()
-        seen += len(message.get("body", b""))
-        if seen > limit:
-            raise HTTPException(413)
-        return message
-
-    return counted
-
-
-def _is_local(host: str) -> bool:
-    """Whether a Host header names this machine by a loopback name."""
-    name, colon, port = host.rpartition(":")
-    name = (name if colon and port.isdecimal() else host).strip("[]").lower()
-    try:
-        return name == "localhost" or ipaddress.ip_address(name).is_loopback
-    except ValueError:
-        return False

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Request, Response
 
 from server.dispatch import Dispatcher
 from server.schema import Readiness
-from server.service import Served, Service
+from server.service import Service
 from server.settings import MIB
 
 router = APIRouter(tags=["health"])
@@ -21,8 +21,9 @@ def get_health() -> dict[str, str]:
 
 
 @router.get("/readyz", responses={503: {"model": Readiness}})
-def get_readiness(request: Request, service: Served, response: Response) -> Readiness:
+def get_readiness(request: Request, response: Response) -> Readiness:
     dispatcher: Dispatcher = request.app.state.dispatcher
+    service: Service = request.app.state.service  # whoever asks: no key is needed to learn that we are ready
     redis = dispatcher.reachable()
     workers = dispatcher.live_workers() if redis else 0
     database = _database_answers(service)

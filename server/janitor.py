@@ -11,6 +11,7 @@ import logging
 import time
 from pathlib import Path
 
+from server.deliveries import purge_deliveries
 from server.intake import Busy, Gone, Intake
 from server.store import Store
 from worker.jobfolder import JobFolder
@@ -23,6 +24,7 @@ ORPHAN_AGE_S = 3600.0
 
 def sweep(store: Store, intake: Intake, data: Path, stale_upload_s: float, now: float) -> None:
     store.submissions.purge()
+    purge_deliveries(store.database)
     for upload_id in store.stale_uploads(now - stale_upload_s):
         try:
             with intake.alone(upload_id, 0.0):

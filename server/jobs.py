@@ -8,11 +8,12 @@ from uuid import UUID
 from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 
+from server import costs
 from server.answers import job_out, retry_after
 from server.problems import ApiProblem, not_found
-from server.schema import EventList, JobIn, JobList, JobOut
+from server.schema import EstimateOut, EventList, JobIn, JobList, JobOut, RestartIn
 from server.service import Served, Service
-from server.submit import submit, submit_as
+from server.submit import restart, submit, submit_as, validate
 from splatcore.options import describe
 from worker.contract import State
 from worker.journal import read_events
@@ -36,6 +37,12 @@ IdempotencyKey = Annotated[
 @router.post("/jobs", status_code=202)
 def submit_job(body: JobIn, service: Served, response: Response, idempotency_key: IdempotencyKey = None) -> JobOut:
     return _submitted(service, response, *submit(service, body, idempotency_key))
+
+
+@router.post("/jobs/validate")
+def validate_job(body: JobIn, service: Served) -> EstimateOut:
+    """What the job would cost. Nothing is run or queued; what cannot be used is refused as a submission would be."""
+    return costs.of(service, *validate(service, body))
 
 
 @router.put("/jobs/{job_id}", status_code=202)
@@ -64,6 +71,18 @@ def cancel_job(job_id: UUID, service: Served, response: Response) -> JobOut:
     if job is None:
         raise not_found("job")
     return _answer(service, job, response)
+
+
+@router.post("/jobs/{job_id}/restart", status_code=202)
+def restart_job(
+    job_id: UUID,
+    service: Served,
+    response: Response,
+    body: RestartIn | None = None,
+    idempotency_key: IdempotencyKey = None,
+) -> JobOut:
+    """A new job from a finished one, with some options changed; unchanged, it goes on from where that was ended."""
+    return _submitted(service, response, *restart(service, service.job(job_id), body or RestartIn(), idempotency_key))
 
 
 @router.delete("/jobs/{job_id}", status_code=204)

@@ -85,6 +85,9 @@ class _Request:
             "status": status,
             "ms": round(seconds * 1000, 1),
         }
+        caller = self._scope.get("state", {}).get("caller")
+        if caller is not None and caller.key_id is not None:
+            fields |= {"tenant": caller.tenant, "key_id": caller.key_id}
         job_id = _job_id(self._scope, self._location)
         if job_id is not None:
             fields["job_id"] = job_id

@@ -1,4 +1,4 @@
-"""The status page: two HTML shells. Their scripts, in static/, read everything from the API.
+"""The status page: three HTML shells. Their scripts, in static/, read everything from the API.
 
 The app mounts static/ at /static.
 """
@@ -29,6 +29,11 @@ _HEADERS = {
 @router.get("/")
 def jobs_page(request: Request) -> HTMLResponse:
     return _templates.TemplateResponse(request, "jobs.html", headers=_HEADERS)
+
+
+@router.get("/sign-in")
+def sign_in_page(request: Request) -> HTMLResponse:
+    return _templates.TemplateResponse(request, "signin.html", headers=_HEADERS)
 
 
 @router.get("/jobs/{job_id}")

@@ -15,6 +15,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
+from server.headers import add_to
 from server.logs import request_id
 from splatcore.errors import Problem
 
@@ -65,9 +66,13 @@ def response(
     return JSONResponse(body, status, headers, media_type="application/problem+json")
 
 
+def answer(problem: ApiProblem) -> JSONResponse:
+    return response(problem.status, problem.name, problem.detail, problem.errors, problem.headers)
+
+
 async def _on_problem(_request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, ApiProblem)
-    return response(error.status, error.name, error.detail, error.errors, error.headers)
+    return answer(error)
 
 
 async def _on_http(_request: Request, error: Exception) -> JSONResponse:
@@ -87,7 +92,9 @@ async def _on_bug(request: Request, error: Exception) -> JSONResponse:
     log.error("%s %s failed", request.method, request.url.path, exc_info=error)
     current = request_id.get()  # this answer is made outside of the middleware that names all others
     headers = None if current is None else {"X-Request-Id": current}
-    return response(500, "internal-server-error", "The server failed; its log says more.", headers=headers)
+    failure = response(500, "internal-server-error", "The server failed; its log says more.", headers=headers)
+    add_to(failure.headers, request.url.scheme, request.url.path)
+    return failure
 
 
 def _pointer(where: Sequence[str | int]) -> str:

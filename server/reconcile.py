@@ -65,12 +65,14 @@ class Reconciler:
         self.recoveries += 1
         log.warning("job %s: the worker of attempt %d is gone", job.id, job.attempt)
         if job.state is State.CANCELLING:
-            folder.discard_results()
-            self._ledger.end_cancel(job.id, job.attempt)
+            self._ledger.end_cancel(job.id, job.attempt, folder.publish_partial(job.attempt))
+            folder.tidy()
         elif folder.published():
             self._ledger.succeed(job.id, job.attempt)
         else:
-            self._ledger.crashed(job, "The worker died")
+            end = self._ledger.crashed(job, "The worker died", folder.advanced(), folder.log_tail())
+            if end is State.FAILED:
+                folder.tidy()
 
     def _end_lost(self, job: Job, message: str) -> None:
         if job.state is State.CANCELLING:

@@ -88,6 +88,8 @@ async def patch_file(upload_id: UUID, name: FileName, request: Request, service:
 @contextlib.asynccontextmanager
 async def _opened(service: Service, upload_id: str, name: str) -> AsyncIterator[tuple[Turn, File, Partial | None]]:
     """This request as the file's only writer; no part if the file is complete."""
+    if await to_thread.run_sync(service.store.upload_file, upload_id, name) is None:
+        raise not_found("file in this upload")  # before the turn, which would end another tenant's request
     async with service.turns.take(upload_id, name) as turn:
         found = await to_thread.run_sync(service.store.upload_file, upload_id, name)
         if found is None:

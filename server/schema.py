@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from worker.contract import State
+from worker.contract import FINISHED, Priority, State
 from worker.ledger import Job
 
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
@@ -31,10 +31,44 @@ class UploadIn(Body):
     files: Annotated[list[FileIn], Field(min_length=1, max_length=50_000)]
 
 
+PriorityName = Literal["low", "normal", "high"]
+
+
 class JobIn(Body):
     scan_id: UUID
     options: dict[str, Any] = Field(default_factory=dict, description="see GET /v1/options")
     name: Name | None = None
+    priority: PriorityName = Field(default="normal", description="among the jobs of the same tenant")
+
+
+class RestartIn(Body):
+    options: dict[str, Any] = Field(default_factory=dict, description="those that change; the others stay")
+    name: Name | None = None
+    priority: PriorityName | None = Field(default=None, description="default: that of the earlier job")
+
+
+class EstimateOut(BaseModel):
+    """What a job would cost; nothing was run."""
+
+    memory_bytes: int
+    seconds: float = Field(description="rough")
+    disk_bytes: int = Field(description="of results, and of the state while it runs")
+    memory_free_bytes: int = Field(description="for the engine, on the server's machine; 0: unknown")
+    disk_free_bytes: int
+    options: dict[str, Any] = Field(description="all of them, defaults filled in")
+    warnings: list[str]
+
+
+class SessionIn(Body):
+    key: Annotated[str, Field(min_length=1, max_length=4096)]
+
+
+class SessionOut(BaseModel):
+    tenant: str
+    key_id: str | None = Field(description="null where there are no keys")
+    scopes: list[str]
+    expires_at: datetime | None = Field(description="of the session; null for who sends a key")
+    csrf: str | None = Field(description="to be sent as X-CSRF-Token; null without a session")
 
 
 class FileOut(BaseModel):
@@ -85,6 +119,8 @@ class JobOut(BaseModel):
     eta_s: float | None
     queue_position: int | None = Field(description="1 is next; null unless queued")
     attempt: int
+    priority: PriorityName
+    restart_of: str | None = Field(description="the job that it was made from")
     options: dict[str, Any]
     created_at: datetime
     started_at: datetime | None
@@ -107,6 +143,8 @@ class JobOut(BaseModel):
             eta_s=job.eta_s,
             queue_position=position,
             attempt=job.attempt,
+            priority=priority_name(job),
+            restart_of=job.restart_of,
             options=job.options,
             created_at=moment(job.created_at),
             started_at=None if job.started_at is None else moment(job.started_at),
@@ -114,6 +152,16 @@ class JobOut(BaseModel):
             error=error,
             links=_job_links(job),
         )
+
+
+_PRIORITY_NAMES: dict[Priority, PriorityName] = {
+    Priority.LOW: "low", Priority.NORMAL: "normal", Priority.HIGH: "high",
+}  # fmt: skip
+PRIORITIES = {name: priority for priority, name in _PRIORITY_NAMES.items()}
+
+
+def priority_name(job: Job) -> PriorityName:
+    return _PRIORITY_NAMES[Priority(job.priority)]
 
 
 class JobList(BaseModel):
@@ -124,6 +172,53 @@ class JobList(BaseModel):
 class EventList(BaseModel):
     events: list[dict[str, Any]] = Field(description="progress events with number, at, attempt, stage, fraction, …")
     last: int = Field(description="number of the last event given; pass it as `after` next time")
+
+
+Event = Literal["job.succeeded", "job.failed", "job.cancelled"]
+
+
+class WebhookIn(Body):
+    url: Annotated[str, Field(min_length=1, max_length=2000)]
+    events: Annotated[set[Event], Field(min_length=1)] = {"job.succeeded", "job.failed", "job.cancelled"}
+
+
+class WebhookOut(BaseModel):
+    id: str
+    url: str
+    events: list[str]
+    created_at: datetime
+    secret: str | None = Field(description="what signatures are made with; told once, when the webhook is made")
+
+
+class WebhookList(BaseModel):
+    webhooks: list[WebhookOut]
+
+
+class DeliveryOut(BaseModel):
+    id: str = Field(description="the `webhook-id` of the message, the same in every attempt")
+    job_id: str
+    event: str
+    state: str = Field(description="waiting, delivered or given up")
+    attempts: int
+    status: int | None = Field(description="of the last answer")
+    error: str | None = Field(description="of the last attempt")
+    created_at: datetime
+    delivered_at: datetime | None
+    next_at: datetime | None
+
+
+class DeliveryList(BaseModel):
+    deliveries: list[DeliveryOut]
+
+
+class Taken(BaseModel):
+    used: int
+    limit: int | None = Field(description="null: none")
+
+
+class Usage(BaseModel):
+    bytes: Taken = Field(description="announced by open uploads, and of scans")
+    active_jobs: Taken = Field(description="queued or running")
 
 
 class Readiness(BaseModel):
@@ -144,6 +239,10 @@ def _job_links(job: Job) -> dict[str, str]:
     links["stream"] = f"{base}/events/stream"
     if job.state is State.SUCCEEDED:
         links |= {"results": f"{base}/results", "report": f"{base}/report"}
+    elif job.partial:
+        links |= {"partial": f"{base}/partial", "report": f"{base}/report"}
+    if job.state in FINISHED:
+        links["restart"] = f"{base}/restart"
     elif job.state in (State.QUEUED, State.RUNNING):
         links["cancel"] = f"{base}/cancel"
     return links

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 from uuid import UUID
 
 from fastapi import Depends, Request
 
+from server.access import Caller
 from server.census import Outcomes
 from server.intake import Intake
 from server.problems import not_found
+from server.quotas import Quotas
 from server.settings import Settings
 from server.store import Store
 from server.turns import Turns
@@ -27,8 +29,19 @@ class Service:
     intake: Intake
     watch: Watch
     outcomes: Outcomes
+    quotas: Quotas
     wake: Callable[[], None]  # have the reconcile loop look at once
     turns: Turns = field(default_factory=Turns)
+    caller: Caller | None = None  # None: the server itself
+
+    def serving(self, caller: Caller) -> Service:
+        """The same for one caller: its store finds nothing that is another tenant's."""
+        return replace(self, store=self.store.of(caller.tenant), caller=caller)
+
+    @property
+    def tenant(self) -> str:
+        assert self.caller is not None, "the server itself has no quota"
+        return self.caller.tenant
 
     def folder(self, job_id: str) -> JobFolder:
         return JobFolder(self.settings.data, job_id)
@@ -41,9 +54,9 @@ class Service:
         return job
 
 
-def _service(request: Request) -> Service:
+def _serving(request: Request) -> Service:
     service: Service = request.app.state.service
-    return service
+    return service.serving(request.state.caller)
 
 
-Served = Annotated[Service, Depends(_service)]
+Served = Annotated[Service, Depends(_serving)]

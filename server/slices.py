@@ -11,19 +11,21 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from worker.jobfolder import JobFolder, write_atomically
+from worker.jobfolder import write_atomically
 
 _SAMPLE = 2_000_000  # voxels looked at for the grey window
 _PERCENTILES = (0.5, 99.5)
 _AXES = {"z": 0, "y": 1, "x": 2}
 
 
-def render(folder: JobFolder, axis: str, index: int, low: float | None, high: float | None) -> bytes:
-    """Slice `index` along `axis`. Raises IndexError outside the volume, FileNotFoundError without one."""
-    volume = _volume(folder.results / "volume.tif")
+def render(results: Path, axis: str, index: int, low: float | None, high: float | None) -> bytes:
+    """Slice `index` along `axis` of the volume in a result folder.
+
+    Raises IndexError outside the volume, FileNotFoundError without one."""
+    volume = _volume(results / "volume.tif")
     plane = volume[(slice(None),) * _AXES[axis] + (index,)]
     if low is None or high is None:
-        auto_low, auto_high = _window(folder, volume)
+        auto_low, auto_high = _window(results, volume)
         low = auto_low if low is None else low
         high = auto_high if high is None else high
     return _png(np.asarray(plane, np.float32)[::-1], low, high)
@@ -42,9 +44,9 @@ def _volume(path: Path) -> Any:
     return np.memmap(path, dtype, "r", offset, shape)
 
 
-def _window(folder: JobFolder, volume: Any) -> tuple[float, float]:
+def _window(results: Path, volume: Any) -> tuple[float, float]:
     """The default grey window: most of the volume's own range. Computed once, kept beside the results."""
-    cache = folder.path / "window.json"
+    cache = results.parent / "window.json"
     try:
         kept = json.loads(cache.read_bytes())
         return float(kept["low"]), float(kept["high"])

@@ -11,6 +11,7 @@ from uuid import uuid4
 import sqlalchemy as sa
 
 from server.submissions import Claim, Submissions
+from worker.contract import LOCAL_TENANT, Priority
 from worker.database import Database, metadata
 from worker.ledger import Ledger
 
@@ -22,6 +23,8 @@ uploads = sa.Table(
     sa.Column("committed", sa.Boolean, nullable=False, default=False),
     sa.Column("created_at", sa.Float, nullable=False),
     sa.Column("touched_at", sa.Float, nullable=False),
+    sa.Column("tenant", sa.String(64), nullable=False, server_default=LOCAL_TENANT),
+    sa.Index("ix_uploads_tenant_created_at", "tenant", "created_at"),
 )
 
 files = sa.Table(
@@ -51,6 +54,8 @@ scans = sa.Table(
     sa.Column("bytes", sa.BigInteger, nullable=False),
     sa.Column("facts", sa.JSON, nullable=False),
     sa.Column("created_at", sa.Float, nullable=False, index=True),
+    sa.Column("tenant", sa.String(64), nullable=False, server_default=LOCAL_TENANT),
+    sa.Index("ix_scans_tenant_created_at", "tenant", "created_at"),
 )
 
 _FILES_AND_PARTS = files.outerjoin(parts, sa.and_(parts.c.upload_id == files.c.upload_id, parts.c.name == files.c.name))
@@ -95,6 +100,7 @@ class Scan:
     bytes: int
     facts: dict[str, Any]
     created_at: float
+    tenant: str
 
 
 @dataclass(frozen=True)
@@ -103,19 +109,40 @@ class NewJob:
     name: str
     options: dict[str, Any]
     claim: Claim | None = None
+    priority: Priority = Priority.NORMAL
+    restart_of: str | None = None
+
+
+Permit = Callable[[sa.Connection], None]
+
+
+def _always(_write: sa.Connection) -> None:
+    """For who has no quota."""
 
 
 class Store:
-    """Everything the server keeps, on one database."""
+    """Everything the server keeps, on one database.
 
-    def __init__(self, database: Database) -> None:
+    With a `tenant` it finds what is that one's and nothing else, whatever id it is asked for: this is where
+    ownership is checked. Without, for the server's own loops, it finds all, and what it makes is `local`'s.
+    """
+
+    def __init__(self, database: Database, tenant: str | None = None) -> None:
         self.database = database
-        self.jobs = Ledger(database)
-        self.submissions = Submissions(database)
+        self.tenant = tenant
+        self.jobs = Ledger(database, tenant)
+        self.submissions = Submissions(database, tenant)
+
+    def of(self, tenant: str) -> Store:
+        return Store(self.database, tenant)
+
+    def _mine(self, table: sa.Table) -> sa.ColumnElement[bool]:
+        return sa.true() if self.tenant is None else table.c.tenant == self.tenant
 
     # Uploads
 
-    def add_upload(self, name: str, announced: Sequence[File]) -> Upload:
+    def add_upload(self, name: str, announced: Sequence[File], permit: Permit = _always) -> Upload:
+        """`permit` may refuse by raising; it sees what there is, and what comes after it cannot change that."""
         upload_id, now = str(uuid4()), time.time()
         rows = [
             {
@@ -128,15 +155,15 @@ class Store:
             for n, f in enumerate(announced)
         ]
         with self.database.writing() as write:
-            write.execute(
-                uploads.insert().values(id=upload_id, name=name, committed=False, created_at=now, touched_at=now)
-            )
+            permit(write)
+            row = {"id": upload_id, "name": name, "committed": False, "created_at": now, "touched_at": now}
+            write.execute(uploads.insert().values(**row, tenant=self.tenant or LOCAL_TENANT))
             write.execute(files.insert(), rows)
         return Upload(upload_id, name, False, now, tuple(announced))
 
     def upload(self, upload_id: str) -> Upload | None:
         with self.database.reading() as read:
-            row = read.execute(sa.select(uploads).where(uploads.c.id == upload_id)).one_or_none()
+            row = read.execute(sa.select(uploads).where(uploads.c.id == upload_id, self._mine(uploads))).one_or_none()
             if row is None:
                 return None
             query = (
@@ -153,7 +180,7 @@ class Store:
         query = (
             sa.select(uploads.c.committed, *_FILE)
             .select_from(_FILES_AND_PARTS.join(uploads, uploads.c.id == files.c.upload_id))
-            .where(files.c.upload_id == upload_id, files.c.name == name)
+            .where(files.c.upload_id == upload_id, files.c.name == name, self._mine(uploads))
         )
         with self.database.reading() as read:
             row = read.execute(query).one_or_none()
@@ -175,7 +202,7 @@ class Store:
             write.execute(uploads.update().where(uploads.c.id == upload_id).values(touched_at=time.time()))
 
     def outstanding_bytes(self) -> int:
-        """Announced by open uploads and not yet here: disk that is spoken for."""
+        """Announced by open uploads, whosever they are, and not yet here: disk that is spoken for."""
         still_to_come = files.c.size - sa.func.coalesce(parts.c.acknowledged, 0)
         query = sa.select(sa.func.coalesce(sa.func.sum(still_to_come), 0)).select_from(
             _FILES_AND_PARTS.join(uploads, uploads.c.id == files.c.upload_id)
@@ -190,7 +217,7 @@ class Store:
 
     def drop_upload(self, upload_id: str) -> bool:
         """Forget an open upload."""
-        is_open = sa.and_(uploads.c.id == upload_id, ~uploads.c.committed)
+        is_open = sa.and_(uploads.c.id == upload_id, self._mine(uploads), ~uploads.c.committed)
         with self.database.writing() as write:
             if write.execute(uploads.select().where(is_open)).first() is None:
                 return False
@@ -202,7 +229,8 @@ class Store:
     # Scans
 
     def commit(self, upload: Upload, facts: dict[str, Any]) -> Scan:
-        scan = Scan(upload.id, upload.name, sum(file.size for file in upload.files), facts, time.time())
+        size, tenant = sum(file.size for file in upload.files), self.tenant or LOCAL_TENANT
+        scan = Scan(upload.id, upload.name, size, facts, time.time(), tenant)
         with self.database.writing() as write:
             write.execute(uploads.update().where(uploads.c.id == upload.id).values(committed=True))
             write.execute(scans.insert().values(**vars(scan)))
@@ -210,18 +238,19 @@ class Store:
 
     def scan(self, scan_id: str) -> Scan | None:
         with self.database.reading() as read:
-            row = read.execute(sa.select(scans).where(scans.c.id == scan_id)).one_or_none()
+            row = read.execute(sa.select(scans).where(scans.c.id == scan_id, self._mine(scans))).one_or_none()
         return None if row is None else Scan(*row)
 
     def scans(self) -> list[Scan]:
-        query = sa.select(scans).order_by(scans.c.created_at.desc(), scans.c.id).limit(1000)
+        query = sa.select(scans).where(self._mine(scans)).order_by(scans.c.created_at.desc(), scans.c.id).limit(1000)
         with self.database.reading() as read:
             return [Scan(*row) for row in read.execute(query)]
 
     def drop_scan(self, scan_id: str) -> bool:
         """Forget a scan, and the upload it came from; False while a job needs it."""
         with self.database.writing() as write:
-            if self.jobs.needs_scan(write, scan_id):
+            mine = sa.and_(scans.c.id == scan_id, self._mine(scans))
+            if write.execute(sa.select(scans.c.id).where(mine)).first() is None or self.jobs.needs_scan(write, scan_id):
                 return False
             write.execute(scans.delete().where(scans.c.id == scan_id))
             write.execute(parts.delete().where(parts.c.upload_id == scan_id))
@@ -231,16 +260,19 @@ class Store:
 
     # Jobs
 
-    def add_job(self, job: NewJob, scan: Scan, place: Callable[[], None]) -> bool:
+    def add_job(self, job: NewJob, scan: Scan, place: Callable[[], None], permit: Permit = _always) -> bool:
         """Queue a job; False if the scan was deleted meanwhile. One transaction with `drop_scan`'s check.
 
         `place` puts the job's folder where it belongs, once id and claim are ours and before others see them.
         Raises IntegrityError if another request took either.
         """
         with self.database.writing() as write:
-            if write.execute(sa.select(scans.c.id).where(scans.c.id == scan.id)).first() is None:
+            mine = sa.and_(scans.c.id == scan.id, self._mine(scans))
+            if write.execute(sa.select(scans.c.id).where(mine)).first() is None:
                 return False
-            self.jobs.add(write, job.id, job.name, (scan.id, scan.name), job.options)
+            permit(write)
+            named = (scan.id, scan.name)
+            self.jobs.add(write, job.id, job.name, named, job.options, job.priority, job.restart_of)
             if job.claim is not None:
                 self.submissions.add(write, job.claim, job.id)
             place()

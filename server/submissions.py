@@ -12,6 +12,7 @@ from enum import StrEnum
 
 import sqlalchemy as sa
 
+from worker.contract import LOCAL_TENANT
 from worker.database import Database, metadata
 from worker.ledger import jobs
 
@@ -26,6 +27,7 @@ class Kind(StrEnum):
 submissions = sa.Table(
     "submissions",
     metadata,
+    sa.Column("tenant", sa.String(64), primary_key=True),
     sa.Column("kind", sa.String(8), primary_key=True),
     sa.Column("name", sa.String(255), primary_key=True),
     sa.Column("digest", sa.String(64), nullable=False),  # of the request's body
@@ -52,28 +54,33 @@ class Earlier:
 
 
 class Submissions:
-    def __init__(self, database: Database) -> None:
+    """Of one tenant, as all tenants may choose the same names; without one, the machine's own."""
+
+    def __init__(self, database: Database, tenant: str | None = None) -> None:
         self._database = database
+        self._tenant = tenant or LOCAL_TENANT
 
     def find(self, claim: Claim) -> Earlier | None:
-        query = sa.select(submissions.c.job_id, submissions.c.digest).where(
-            submissions.c.kind == claim.kind.value, submissions.c.name == claim.name, ~_outdated()
-        )
+        query = sa.select(submissions.c.job_id, submissions.c.digest).where(self._named(claim), ~_outdated())
         with self._database.reading() as read:
             row = read.execute(query).one_or_none()
         return None if row is None else Earlier(*row)
 
     def add(self, write: sa.Connection, claim: Claim, job_id: str) -> None:
         """Within the caller's transaction. Raises IntegrityError if another took the name first."""
-        row = {"kind": claim.kind.value, "name": claim.name}
-        mine = sa.and_(submissions.c.kind == claim.kind.value, submissions.c.name == claim.name)
-        write.execute(submissions.delete().where(mine, _outdated()))
+        row = {"tenant": self._tenant, "kind": claim.kind.value, "name": claim.name}
+        write.execute(submissions.delete().where(self._named(claim), _outdated()))
         write.execute(submissions.insert().values(**row, digest=claim.digest, job_id=job_id, created_at=time.time()))
 
     def purge(self) -> None:
-        """Forget what is not remembered any more. Apart from `add`, where two at once might lock each other out."""
+        """Forget what is not remembered any more, of all tenants. Apart from `add`, where two at once might lock each
+        other out."""
         with self._database.writing() as write:
             write.execute(submissions.delete().where(_outdated()))
+
+    def _named(self, claim: Claim) -> sa.ColumnElement[bool]:
+        named = sa.tuple_(submissions.c.kind, submissions.c.name) == (claim.kind.value, claim.name)
+        return sa.and_(submissions.c.tenant == self._tenant, named)
 
 
 def _outdated() -> sa.ColumnElement[bool]:

@@ -8,13 +8,14 @@ from uuid import UUID, uuid4
 
 from sqlalchemy.exc import IntegrityError
 
-from server.problems import ApiProblem, invalid
-from server.schema import JobIn
+from server.problems import ApiProblem, invalid, not_found
+from server.schema import PRIORITIES, JobIn, RestartIn, priority_name
 from server.service import Service
 from server.store import NewJob, Scan
 from server.submissions import Claim, Earlier, Kind
 from splatcore.errors import OptionsError, Problem
 from splatcore.options import Options
+from worker.contract import FINISHED
 from worker.ledger import Job
 
 
@@ -28,19 +29,43 @@ def submit_as(service: Service, body: JobIn, job_id: UUID) -> tuple[Job, bool]:
     return _submit(service, body, str(job_id), Claim(Kind.ID, str(job_id), _digest(body)))
 
 
-def _submit(service: Service, body: JobIn, job_id: str, claim: Claim | None) -> tuple[Job, bool]:
-    earlier = None if claim is None else service.store.submissions.find(claim)
-    if claim is not None and earlier is not None:  # before all checks: its scan may be gone since
-        return _repeated(service, claim, earlier), True
+def restart(service: Service, earlier: Job, body: RestartIn, key: str | None) -> tuple[Job, bool]:
+    """A new job of an earlier one's scan and options, some of them changed. With the same options it goes on from
+    where the earlier one was ended."""
+    if earlier.state not in FINISHED:
+        raise ApiProblem(409, "not-finished", "The job has not finished; cancel it first.")
+    again = JobIn(
+        scan_id=UUID(earlier.scan_id),
+        options=earlier.options | body.options,
+        name=body.name or earlier.name,
+        priority=body.priority or priority_name(earlier),
+    )
+    claim = None if key is None else Claim(Kind.KEY, key, _digest(again, earlier.id))
+    return _submit(service, again, str(uuid4()), claim, earlier)
+
+
+def validate(service: Service, body: JobIn) -> tuple[Scan, Options]:
+    """What a request asks for. Raises the 422 that it would be answered with."""
     scan = service.store.scan(str(body.scan_id))
     if scan is None:
         raise invalid("There is no such scan.", [Problem("scan_id", "names no committed scan")])
     try:
-        options = Options.from_dict(body.options).to_dict()
+        return scan, Options.from_dict(body.options)
     except OptionsError as error:
         raise invalid("An option cannot be used.", [Problem("options", str(error))]) from None
+
+
+def _submit(
+    service: Service, body: JobIn, job_id: str, claim: Claim | None, restarted: Job | None = None
+) -> tuple[Job, bool]:
+    earlier = None if claim is None else service.store.submissions.find(claim)
+    if claim is not None and earlier is not None:  # before all checks: its scan may be gone since
+        return _repeated(service, claim, earlier), True
+    scan, options = validate(service, body)
+    source = None if restarted is None else restarted.id
+    job = NewJob(job_id, body.name or scan.name, options.to_dict(), claim, PRIORITIES[body.priority], source)
     try:
-        _queue(service, scan, NewJob(job_id, body.name or scan.name, options, claim))
+        _queue(service, scan, job)
     except IntegrityError:
         if claim is None:
             raise
@@ -55,7 +80,9 @@ def _queue(service: Service, scan: Scan, job: NewJob) -> None:
     made, folder = service.folder(f".new-{uuid4()}"), service.folder(job.id)
     try:
         made.create(service.intake.scan_folder(scan.id))
-        queued = service.store.add_job(job, scan, lambda: made.become(folder))
+        if job.restart_of is not None:
+            made.go_on_from(service.folder(job.restart_of))
+        queued = service.store.add_job(job, scan, lambda: made.become(folder), service.quotas.place_for(service.tenant))
     except FileNotFoundError:
         queued = False
     finally:
@@ -66,8 +93,8 @@ def _queue(service: Service, scan: Scan, job: NewJob) -> None:
 
 def _lost_race(service: Service, claim: Claim) -> Job:
     earlier = service.store.submissions.find(claim)
-    if earlier is None:  # its id is that of a job which was submitted without one
-        raise _other(claim)
+    if earlier is None:  # its id is that of a job which was submitted without one, or by another tenant
+        raise _other(claim) if service.store.jobs.get(claim.name) else not_found("job")
     return _repeated(service, claim, earlier)
 
 
@@ -93,6 +120,9 @@ def _other(claim: Claim) -> ApiProblem:
     return ApiProblem(409, "job-exists", "There is a job of this id, and another request made it.", [fault])
 
 
-def _digest(body: JobIn) -> str:
-    """Of what was asked for; how the JSON was laid out is no difference."""
-    return hashlib.sha256(json.dumps(body.model_dump(mode="json"), sort_keys=True).encode()).hexdigest()
+def _digest(body: JobIn, restart_of: str | None = None) -> str:
+    """Of what was asked for; how the JSON was laid out is no difference, nor is a default that was written out."""
+    asked = body.model_dump(mode="json") | ({} if restart_of is None else {"restart_of": restart_of})
+    if asked["priority"] == "normal":
+        del asked["priority"]
+    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()

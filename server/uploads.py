@@ -40,8 +40,9 @@ def create_upload(body: UploadIn, service: Served, response: Response) -> Upload
     if problems:
         raise invalid("The announced files cannot be accepted.", problems[:200])
     announced = [File(f.name, f.size, f.sha256.lower() if f.sha256 else None, None) for f in body.files]
-    _require_room(service, sum(file.size for file in announced))
-    upload = service.store.add_upload(body.name, announced)
+    size = sum(file.size for file in announced)
+    _require_room(service, size)
+    upload = service.store.add_upload(body.name, announced, service.quotas.room_for(service.tenant, size))
     service.intake.create(upload.id)
     response.headers["Location"] = f"/v1/uploads/{upload.id}"
     return _upload_out(upload)

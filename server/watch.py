@@ -136,9 +136,7 @@ class Watch:
     def _look(self, tails: dict[str, Tail | None]) -> dict[str, tuple[Sight, list[Line]]]:
         """The rows before the journals: when a row says that the job has finished, all its events are there."""
         jobs = {job.id: job for job in self._ledger.many(list(tails))}
-        queue: dict[str, int] = {}
-        if any(job.state is State.QUEUED for job in jobs.values()):
-            queue = {job_id: n for n, job_id in enumerate(self._ledger.queue(), start=1)}
+        queue = self._ledger.positions() if any(job.state is State.QUEUED for job in jobs.values()) else {}
         return {
             job_id: (Sight(jobs.get(job_id), queue.get(job_id)), [] if tail is None else tail.fetch())
             for job_id, tail in tails.items()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 
@@ -60,4 +61,17 @@ def conclude(
         report=report,
         options=options,
         timings=timings,
+    )
+
+
+def mark_partial(report: dict[str, Any], fraction: float) -> None:
+    """Say first of all that the run was ended before its time. fraction: of the work that was done."""
+    text = (
+        f"The run was ended on request when about {fraction:.0%} of its work was done: volume and poses are not what a "
+        "whole run would have found."
+    )
+    report["partial"] = {"fraction": fraction}
+    report["verdict"] = f"{text} {report['verdict']}"
+    report["findings"].insert(
+        0, {"name": "partial result", "severity": "warning", "text": text, "evidence": {"fraction": fraction}}
     )

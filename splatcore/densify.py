@@ -7,6 +7,7 @@ that left the volume are dropped. Lengths and densities are those of `splatcore.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,13 @@ class ScreenGradient:
             length *= np.abs(means @ normal.astype(np.float32) - np.float32(normal @ frame[0]))
         self._sum += length
         self._seen += length > 0
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"sum": self._sum, "seen": self._seen}
+
+    def load(self, state: dict[str, Any]) -> None:
+        self._sum, self._seen = state["sum"], state["seen"]
 
     def mean(self) -> Floats:
         """Over the views that showed the splat. [n]"""

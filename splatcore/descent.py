@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from splatcore import _native
 from splatcore.geometry import Array
 from splatcore.planar import Plane
 from splatcore.splats import Floats, Splats
+
+_REMADE = ("renderer", "gradient")  # scratch: nothing in them outlasts a step
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,7 @@ class Descent:
     ) -> None:
         """scale_limits: the smallest and largest standard deviation, mm; 0.15 and 20 voxels where left out.
         plane: where all splats stay, of a line detector."""
+        self._rows, self._cols = rows, cols
         self.renderer = _native.Renderer32(rows, cols, threads)
         self._limits = scale_limits or (0.15 * voxel_mm, 20 * voxel_mm)
         self._unit, self._steps, self._rates, self._voxel = density_unit, max(steps, 1), rates, voxel_mm
@@ -95,6 +99,22 @@ class Descent:
         other.gradient = self.splats.zeros_like()
         other.replace(self.splats)
         return other
+
+    def state(self) -> dict[str, Any]:
+        """All that `from_state` needs to go on with the same bits."""
+        return {name: value for name, value in vars(self).items() if name not in _REMADE}
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> Descent:
+        other = cls.__new__(cls)
+        other.load(state)
+        return other
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Become what `state` is of."""
+        vars(self).update(state)
+        self.renderer = _native.Renderer32(self._rows, self._cols, self.threads)
+        self.gradient = self.splats.zeros_like()
 
     def step(self, frame: Array, cone: bool, target: Floats, mask: Floats | None) -> float:
         """One Adam step on one view. Returns the loss before it."""

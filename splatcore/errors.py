@@ -4,6 +4,7 @@ SplatCTError
   ScanError             a scan folder cannot be used; lists every problem found
   OptionsError          an option is unknown, of the wrong type, or out of range
   ResultError           a result folder cannot be read or written
+  CheckpointError       a run's state cannot be gone on from
   ReconstructionError   the engine cannot go on (diverged, no signal in the data)
 
 Each message says what is wrong, what was given, what was expected and what to try.
@@ -52,6 +53,10 @@ class OptionsError(SplatCTError):
 
 class ResultError(SplatCTError):
     """A result folder cannot be read or written."""
+
+
+class CheckpointError(SplatCTError):
+    """A checkpoint cannot be gone on from; its text says why, as the end of a sentence."""
 
 
 class ReconstructionError(SplatCTError):

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from splatcore.estimate import estimate
 from splatcore.geometry import Array, Frames
 from splatcore.grid import VolumeGrid
+from splatcore.options import Options
 from splatcore.projections import Conversion, Image, Stacks
 from splatcore.redundancy import lopsidedness
 from splatcore.scanjson import ScanHeader
@@ -191,21 +193,12 @@ def conversion_warnings(conversion: Conversion, views: int) -> list[str]:
     return found
 
 
-def estimate(frames: Frames, grid: VolumeGrid) -> tuple[int, float]:
-    """(bytes of memory, seconds at quality "normal" on two cores), rough: fitted to 75 views of 256^2 and 512^2 on
-    grids of 128^3 and 256^3, on a processor with AVX-512."""
-    pixels = len(frames) * frames.rows * frames.cols
-    memory = 400e6 + 4 * (3 * pixels + 4 * grid.voxels)
-    seconds = 45 * (pixels / (75 * 256**2)) ** 0.85 * max(1.0, grid.voxels / max(pixels, 1)) ** 0.5
-    return int(memory), round(max(5.0, seconds), 1)
-
-
 def gather(
     header: ScanHeader, stacks: Stacks, grid: VolumeGrid, conversion: Conversion | None, pixels: PixelFacts | None
 ) -> ScanFacts:
     frames = header.frames
     arc, gap = arc_and_gap(frames)
-    memory, seconds = estimate(frames, grid)
+    cost = estimate(len(frames), frames.rows, frames.cols, grid.shape, Options())
     warnings = geometry_warnings(header, grid, arc)
     dtype = stacks.images[0].dtype
     if pixels is not None:
@@ -219,5 +212,5 @@ def gather(
         bad_pixels=int(np.count_nonzero(conversion.bad)) if conversion is not None else 0,
         line_integral=pixels.line_integral() if pixels is not None else None,
         air_level=pixels.air_level if pixels is not None else None,
-        estimated_memory_bytes=memory, estimated_seconds=seconds, warnings=warnings,
+        estimated_memory_bytes=cost.memory_bytes, estimated_seconds=cost.seconds, warnings=warnings,
     )  # fmt: skip

@@ -7,6 +7,8 @@ R = W0' W, tau = W0' dt before it is seen: t0 drops out, and parallel beams need
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from splatcore.geometry import Array, Frames, RigidMotions, quaternion_from_rotation
@@ -28,6 +30,13 @@ class Increments:
         self._moments = np.zeros((2, len(nominal), 7))
         self._visits = np.zeros(len(nominal), np.int64)
         self._steps, self._faster = max(steps, 1), faster
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"values": self.values, "moments": self._moments, "visits": self._visits}
+
+    def load(self, state: dict[str, Any]) -> None:
+        self.values, self._moments, self._visits = state["values"], state["moments"], state["visits"]
 
     def motion(self, view: int) -> tuple[Array, Array]:
         """The object's motion (R [3, 3], tau [3]) that the view's increment amounts to."""

@@ -103,12 +103,17 @@ def mirrored(frames: Frames, columns: bool, rows: bool) -> Frames:
 
 def oriented(scan: Scan, options: Options, threads: int) -> tuple[Scan, Verdict]:
     """The scan with its frames turned the way its images lie, as options say and trials find."""
-    scan = replace(scan, frames=mirrored(scan.frames, options.flip_u, options.flip_v))
     if options.rotation == "auto":
-        verdict = find_orientation(scan, options.seed, threads)
+        mirrored_scan = read_as(scan, options, Orientation())
+        verdict = find_orientation(mirrored_scan, options.seed, threads)
     else:
         verdict = Verdict(Orientation(reversed=options.rotation == "reversed"), {}, False, "the options settle it")
-    return replace(scan, frames=verdict.found.apply(scan.frames)), verdict
+    return read_as(scan, options, verdict.found), verdict
+
+
+def read_as(scan: Scan, options: Options, found: Orientation) -> Scan:
+    """The scan with its frames turned the way its images lie, as options say and an earlier trial found."""
+    return replace(scan, frames=found.apply(mirrored(scan.frames, options.flip_u, options.flip_v)))
 
 
 def find_orientation(scan: Scan, seed: int, threads: int) -> Verdict:

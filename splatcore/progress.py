@@ -14,7 +14,8 @@ from typing import Any
 class Progress:
     """One event. `fraction` is the share of the expected work done, 0 to 1, never falling.
 
-    stage: "read", "start", "level", "poses", "diagnose", "write" or "done".
+    stage: "read", "start", "level", "poses", "refine", "checkpoint" (it could not be written), "diagnose", "write" or
+    "done".
     message: one plain sentence.  loss: mean absolute residual in line-integral units.
     moved_deg, moved_mm: RMS change of the poses in the last sweep (stage "poses").
     """

@@ -11,20 +11,22 @@ clipping in place of a sigmoid; footprints end at four standard deviations.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Generator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from splatcore import _native
-from splatcore.conclusion import conclude
+from splatcore.checkpoint import identity
+from splatcore.conclusion import conclude, mark_partial
 from splatcore.densify import Rules, ScreenGradient, densify
 from splatcore.descent import Descent, Rates
 from splatcore.errors import OptionsError, ReconstructionError
 from splatcore.geometry import Array, RigidMotions
 from splatcore.increments import Increments
+from splatcore.keeper import Concluding, Keeper
 from splatcore.machine import threads_allowed
 from splatcore.options import Options
 from splatcore.poses import Prior, accumulate, sigmas
@@ -32,6 +34,7 @@ from splatcore.progress import Progress
 from splatcore.reconstruction import Reconstruction
 from splatcore.scan import Scan
 from splatcore.scene import Scene, scene_of
+from splatcore.schedule import Clock
 from splatcore.splats import Splats
 from splatcore.static import Static, split_static
 from splatcore.variation import Variation
@@ -47,6 +50,8 @@ _DENSIFY_FROM, _DENSIFY_EVERY, _DENSIFY_UNTIL = 500, 100, 0.5  # steps; the last
 _DSSIM = 2 * _SSIM / (1 + 2 * _SSIM)
 _WEIGHT = 1 - _DSSIM
 _CORNER = 1e-6  # of the Huber function, so small that it is L1
+# What changes during a run beside splats, poses and generator.
+_STATE = ("_fraction", "_step", "_order", "_loss", "_drawn")
 
 
 @dataclass(frozen=True)
@@ -80,17 +85,28 @@ def resolved(scan: Scan, options: Options) -> Options:
 
 
 def reconstruct(
-    scan: Scan, options: Options, switches: Switches | None = None
+    scan: Scan, options: Options, switches: Switches | None = None, keeper: Keeper | None = None
 ) -> Generator[Progress, None, Reconstruction]:
     """Reconstruct by `options.method`, r2 or paper. Yields Progress, returns the Reconstruction.
 
-    Raises OptionsError, and ReconstructionError where the projections hold nothing to reconstruct.
+    keeper: as in `splatcore.reconstruct`; the switches of a run that is gone on with must be the same.
+
+    Raises OptionsError, ReconstructionError where the projections hold nothing to reconstruct, and Stopped.
     """
-    run = _Run(scan, resolved(scan, options), switches or Switches())
-    yield run.progress("start", f"{len(scan.frames)} views of {scan.frames.rows} x {scan.frames.cols}")
-    yield from run.optimise()
+    options, keeper = resolved(scan, options), keeper or Keeper()
+    state, word = keeper.recall(lambda: identity(scan, options), (Rates, Splats))
+    run = _Run(scan, options, switches or Switches(), keeper)
+    if state is not None:
+        run.go_on(state)
+    facts = f"{len(scan.frames)} views of {scan.frames.rows} x {scan.frames.cols}"
+    yield run.progress("start", f"{word}; {facts}" if word else facts)
+    whole = True
+    try:
+        yield from run.optimise()
+    except Concluding:
+        whole = False
     yield run.progress("diagnose", "compare nominal and corrected geometry")
-    result = run.finish()
+    result = run.finish(whole)
     yield run.progress("done", result.report["verdict"])
     return result
 
@@ -98,12 +114,14 @@ def reconstruct(
 class _Run:
     """One reconstruction under way."""
 
-    def __init__(self, scan: Scan, options: Options, switches: Switches) -> None:
+    def __init__(self, scan: Scan, options: Options, switches: Switches, keeper: Keeper) -> None:
         assert options.threads is not None and options.splats is not None and options.steps is not None
-        self._scan, self._options, self._switches = scan, options, switches
+        self._scan, self._options, self._switches, self._keeper = scan, options, switches, keeper
         self._threads, self._steps = options.threads, options.steps
-        self._began = time.monotonic()
+        self._clock = Clock()
         self._fraction = 0.0
+        self._step, self._order = 0, list[int]()  # views left in this epoch
+        self._loss, self._drawn = 0.0, 0  # of this epoch
         self._rng = np.random.default_rng(options.seed)
         self._scene = scene_of(scan, self._threads, switches.unit)
         scene = self._scene
@@ -118,29 +136,54 @@ class _Run:
             rates=_RATES, huber=_CORNER, dssim=_DSSIM, data_range=1.0, threads=self._threads, scale_limits=_SCALES,
         )  # fmt: skip
 
+        self._screen = self._new_screen()
+
+    def _new_screen(self) -> ScreenGradient:
+        frames = self._scene.frames
+        return ScreenGradient(len(self._descent.splats), frames.rows, frames.cols, frames.beam == "cone")
+
+    def state(self) -> dict[str, Any]:
+        """All that `go_on` needs, between any two steps."""
+        plain = {name: getattr(self, name) for name in _STATE}
+        return plain | {
+            "clock": self._clock.state(), "rng": self._rng.bit_generator.state, "descent": self._descent.state(),
+            "screen": self._screen.state(), "poses": self._poses and self._poses.state(),
+        }  # fmt: skip
+
+    def go_on(self, state: dict[str, Any]) -> None:
+        """From where an interrupted run was."""
+        for name in _STATE:
+            setattr(self, name, state[name])
+        self._clock.go_on(state["clock"])
+        self._rng.bit_generator.state = state["rng"]
+        self._descent.load(state["descent"])
+        self._screen = self._new_screen()
+        self._screen.load(state["screen"])
+        if self._poses is not None:
+            self._poses.load(state["poses"])
+
     def progress(self, stage: str, message: str, **facts: object) -> Progress:
-        return Progress(stage, self._fraction, message, time.monotonic() - self._began, **facts)  # type: ignore[arg-type]
+        return Progress(stage, self._fraction, message, self._clock.seconds, **facts)  # type: ignore[arg-type]
 
     def optimise(self) -> Generator[Progress, None, None]:
         """All Adam steps, one view each, with adaptive control in the first half."""
         scene, descent, rules = self._scene, self._descent, Rules()
         packed, cone, views = scene.frames.packed(), scene.frames.beam == "cone", len(scene.frames)
-        rows, cols = scene.frames.rows, scene.frames.cols
         until = int(_DENSIFY_UNTIL * self._steps) if self._switches.densify else 0
-        screen = ScreenGradient(len(descent.splats), rows, cols, cone)
         v_motion = np.zeros(6)
-        order: list[int] = []
-        loss, drawn = 0.0, 0
-        for step in range(1, self._steps + 1):
-            order = order or list(self._rng.permutation(views))
-            view = order.pop()
+        while self._step < self._steps:
+            self._keeper.pause(self.state)
+            self._order = self._order or self._rng.permutation(views).tolist()
+            view = self._order.pop()
+            self._step += 1
+            step = self._step
             frame = packed[view] if self._poses is None else self._poses.frame(view)
-            loss += descent.differentiate(
+            self._loss += descent.differentiate(
                 frame, cone, scene.images[view], scene.mask, None if self._poses is None else v_motion
             )
-            drawn += 1
+            self._drawn += 1
             if step < until:
-                screen.add(frame, descent.splats.means, descent.gradient.means)
+                self._screen.add(frame, descent.splats.means, descent.gradient.means)
             if self._poses is not None:
                 self._poses.step(view, self._pose_gradient(v_motion), step - 1)
             if self._variation is not None:
@@ -148,21 +191,22 @@ class _Run:
             descent.update()
             if _DENSIFY_FROM < step < until and step % _DENSIFY_EVERY == 0:
                 if len(descent.splats) < rules.most:
-                    hard = screen.mean() / np.float32(_WEIGHT)
+                    hard = self._screen.mean() / np.float32(_WEIGHT)
                     descent.repopulate(*densify(descent.splats, hard, rules, scene.grid, self._rng))
-                screen = ScreenGradient(len(descent.splats), rows, cols, cone)
-            if order and step < self._steps:
+                self._screen = self._new_screen()
+            if self._order and step < self._steps:
                 continue
+            loss, drawn = self._loss, self._drawn
             if not (np.isfinite(loss) and len(descent.splats)):
                 raise ReconstructionError(
                     f"the loss became {loss} with {len(descent.splats)} splats left at step {step}; try another method"
                 )
             self._fraction = 0.9 * step / self._steps
+            self._loss, self._drawn = 0.0, 0
             yield self.progress(
                 "level", f"step {step} of {self._steps}", level=1, step=step, splats=len(descent.splats),
                 loss=loss / drawn * scene.unit * scene.length_mm,
             )  # fmt: skip
-            loss, drawn = 0.0, 0
 
     def _pose_gradient(self, v_motion: Array) -> Array:
         """dL/d(omega, tau), or the part of it that goes through the splats' means."""
@@ -172,10 +216,10 @@ class _Run:
         torque = moment - moment.T
         return np.array([torque[1, 2], torque[2, 0], torque[0, 1], *v_motion[3:]], np.float64)
 
-    def finish(self) -> Reconstruction:
-        """The result in mm, with its report."""
+    def finish(self, whole: bool) -> Reconstruction:
+        """The result in mm, with its report; `whole`: all steps are done."""
         scan, scene = self._scan, self._scene
-        timings = {"binning_1": time.monotonic() - self._began}
+        timings = {"binning_1": self._clock.seconds}
         splats = scene.splats_mm(self._descent.splats)
         motions = RigidMotions.identity(len(scan.frames))
         if self._poses is not None:
@@ -194,8 +238,10 @@ class _Run:
         static, corrections = split_static(scan.frames, Static(), motions)
         result = conclude(
             scan, self._options, splats, corrected, corrections, (static.to_json(scan.frames), {}), normals, sigma,
-            gauge, timings, self._began,
+            gauge, timings, self._clock.began,
         )  # fmt: skip
+        if not whole:
+            mark_partial(result.report, self._fraction)
         self._fraction = 1.0
         return result
 

@@ -8,7 +8,7 @@ materials gains decibels by it, a smooth one loses. Views left out for a while s
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -70,22 +70,64 @@ class Refinement:
         half = float(here.grid.half_extent_mm().max())
         self._variation = Variation(here.grid, _EVERY * weight * half, descent.threads) if weight else None
         self.step = 0
+        self._order: list[int] = []  # views still to be drawn in this epoch
+        self._loss, self._drawn = 0.0, 0  # of this epoch; its views
 
-    def run(self, frames: Frames, steps: int) -> Generator[float, None, None]:
-        """Until `step` is `steps`. Yields after every epoch (each view once, in random order) its mean loss."""
+    def run(self, frames: Frames, steps: int, book: Book | None = None) -> Generator[float, None, None]:
+        """Until `step` is `steps`. Yields after every epoch (each view once, in random order) its mean loss.
+
+        book: of an interrupted run goes on from there, and is told of every step."""
         packed, cone, here = frames.packed(), frames.beam == "cone", self._here
+        if book:
+            book.enter(self)
         while self.step < steps:
-            loss, order = 0.0, self._rng.permutation(self._views)[: steps - self.step]
-            for view in order:
-                loss += self.descent.differentiate(packed[view], cone, here.images[view], here.mask)
-                self.step += 1
-                if self._variation and self.step % _EVERY == 0:
-                    self._variation.add_gradient(self.descent.splats, self.descent.gradient, self._rng)
-                self.descent.update()
-            yield loss / len(order)
+            if not self._order:
+                self._order = self._rng.permutation(self._views)[: steps - self.step].tolist()
+                self._loss, self._drawn = 0.0, len(self._order)
+            view = self._order.pop(0)
+            self._loss += self.descent.differentiate(packed[view], cone, here.images[view], here.mask)
+            self.step += 1
+            if self._variation and self.step % _EVERY == 0:
+                self._variation.add_gradient(self.descent.splats, self.descent.gradient, self._rng)
+            self.descent.update()
+            if not self._order:
+                yield self._loss / self._drawn
+            if book:
+                book.pause()
+
+    def state(self) -> dict[str, Any]:
+        """All that `load` needs to go on with the same bits."""
+        kept = {name: getattr(self, name) for name in ("step", "_order", "_loss", "_drawn")}
+        return {**kept, "descent": self.descent.state(), "rng": self._rng.bit_generator.state}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Become what `state` is of, the descent in place: others hold it."""
+        for name in ("step", "_order", "_loss", "_drawn"):
+            setattr(self, name, state[name])
+        self.descent.load(state["descent"])
+        self._rng.bit_generator.state = state["rng"]
 
 
-def weigh(descent: Descent, here: Level, frames: Frames, held: Indices, seed: int) -> Generator[float, None, Weighing]:
+class Book:
+    """The refinements of a stage in the order in which they ran, for a checkpoint. A stage that is played again with
+    the states of an earlier run passes over what was done then: each refinement finds itself where it was."""
+
+    def __init__(self, pause: Callable[[], None], earlier: Sequence[dict[str, Any]] = ()) -> None:
+        self.pause = pause
+        self._earlier, self._entered = earlier, list[Refinement]()
+
+    def enter(self, refinement: Refinement) -> None:
+        if len(self._entered) < len(self._earlier):
+            refinement.load(self._earlier[len(self._entered)])
+        self._entered.append(refinement)
+
+    def state(self) -> list[dict[str, Any]]:
+        return [refinement.state() for refinement in self._entered]
+
+
+def weigh(
+    descent: Descent, here: Level, frames: Frames, held: Indices, seed: int, book: Book | None = None
+) -> Generator[float, None, Weighing]:
     """The weight of the variation that best predicts views (indices) left out. Yields losses.
 
     First the splats forget those views: rates rise, the other views are drawn. Then short branches, one for each
@@ -98,12 +140,12 @@ def weigh(descent: Descent, here: Level, frames: Frames, held: Indices, seed: in
     def unseen(start: Descent, weight: float) -> Generator[float, None, Array]:
         """Mean squared residuals of the views left out, once the splats have come to rest."""
         branch = start.branch(_TRIAL_STEPS, MOVING.times(_REST), corner)
-        yield from Refinement(branch, here, kept, weight, np.random.default_rng(seed)).run(frames, _TRIAL_STEPS)
+        yield from Refinement(branch, here, kept, weight, np.random.default_rng(seed)).run(frames, _TRIAL_STEPS, book)
         return np.array([r @ r / r.size for r in _residuals(branch, here, frames, held)])
 
     def forget(start: Descent, seed: int) -> Generator[float, None, Descent]:
         branch = start.branch(_FORGET, MOVING, corner)
-        yield from Refinement(branch, here, kept, 0.0, np.random.default_rng(seed)).run(frames, _FORGET)
+        yield from Refinement(branch, here, kept, 0.0, np.random.default_rng(seed)).run(frames, _FORGET, book)
         return branch
 
     forgetful = yield from forget(descent, seed)

@@ -11,7 +11,6 @@ import contextlib
 import hashlib
 import json
 import math
-import os
 import platform
 import tempfile
 import zipfile
@@ -28,9 +27,11 @@ from numpy.typing import NDArray
 
 import splatcore
 from splatcore.document import Document
+from splatcore.durable import renamed
 from splatcore.errors import ResultError, ScanError
 from splatcore.geometry import Frames
 from splatcore.grid import VolumeGrid
+from splatcore.keeper import FILE
 from splatcore.posefile import poses_document, read_poses
 from splatcore.reconstruction import Reconstruction
 from splatcore.splats import Splats
@@ -59,7 +60,8 @@ class Results:
 def prepare_folder(folder: Path | str, overwrite: bool = False) -> Path:
     """Makes the folder, or makes sure it may be written to. Call before the work, not after it.
 
-    Raises ResultError where it holds anything and `overwrite` is false, and where it is a scan."""
+    Raises ResultError where it holds anything and `overwrite` is false, and where it is a scan. What an interrupted
+    run left, a state and no manifest, may be gone on with."""
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise ResultError(f"{folder} is a file, expected a folder; choose another name")
@@ -67,13 +69,20 @@ def prepare_folder(folder: Path | str, overwrite: bool = False) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / "scan.json").exists():
             raise ResultError(f"{folder} is a scan folder; write the results to a folder of their own")
-        if not overwrite and next(folder.iterdir(), None) is not None:
+        if not overwrite and not _interrupted(folder) and next(folder.iterdir(), None) is not None:
             raise ResultError(f"{folder} is not empty; choose another folder, or overwrite it with --overwrite")
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         raise ResultError(f"{folder} cannot be written to: {error.strerror or error}") from error
     return folder
+
+
+def _interrupted(folder: Path) -> bool:
+    """Whether the folder holds the state of a run without results, and nothing that such a run does not write."""
+    ours = {FILE, "volume.tif", "splats.npz", "poses.json", "report.json", "report.html"}
+    found = {path.name.removeprefix(".").removesuffix(".part") for path in folder.iterdir()}
+    return FILE in found and found <= ours
 
 
 def write_results(reconstruction: Reconstruction, folder: Path | str, overwrite: bool = False) -> dict[str, Any]:
@@ -95,7 +104,7 @@ def write_results(reconstruction: Reconstruction, folder: Path | str, overwrite:
         (folder / _MANIFEST).unlink(missing_ok=True)  # what stands here is no longer whole
         files = []
         for name, write in writers.items():
-            with _renamed(folder / name) as file:
+            with renamed(folder / name) as file:
                 write(file)
             files.append(_entry(folder / name))
         manifest = {
@@ -110,7 +119,7 @@ def write_results(reconstruction: Reconstruction, folder: Path | str, overwrite:
             "device": r.device,
             "timings": r.timings,
         }
-        with _renamed(folder / _MANIFEST) as file:
+        with renamed(folder / _MANIFEST) as file:
             _write_json(file, manifest)
     except OSError as error:
         raise ResultError(f"{folder} cannot be written to: {error.strerror or error}") from error
@@ -203,20 +212,6 @@ def _not_finite(value: Any, pointer: str = "") -> Iterator[str]:
     elif isinstance(value, list | tuple):
         for i, item in enumerate(value):
             yield from _not_finite(item, f"{pointer}/{i}")
-
-
-@contextlib.contextmanager
-def _renamed(path: Path) -> Iterator[BinaryIO]:
-    """A file that takes its name once it is written and flushed to disk."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _entry(path: Path) -> dict[str, Any]:

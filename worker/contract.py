@@ -10,8 +10,11 @@ from enum import IntEnum, StrEnum
 
 QUEUE = "splatct"
 TASK = "worker.supervise.run_job"
+LOCAL_TENANT = "local"  # whose everything is as long as there are no keys
 
-MAX_CRASHES = 3  # attempts that may die before the job is given up; hand-backs do not count
+# Attempts that may die without getting further before the job is given up; hand-backs do not count. More than a
+# few, since going on from a checkpoint costs little, and the next death may be the machine's fault again.
+MAX_CRASHES = 5
 HEARTBEAT_S = 2.0  # how often a supervisor marks its row
 DEAD_S = 8.0  # a heartbeat older than this, on another host, is a dead worker
 STUCK_S = 60.0  # on this host, where the lock still proves life, wait this long instead
@@ -40,6 +43,14 @@ FINISHED = frozenset(state for state, onward in TRANSITIONS.items() if not onwar
 ACTIVE = frozenset(State) - FINISHED
 
 
+class Priority(IntEnum):
+    """Of a tenant's jobs, those of a higher one are run first."""
+
+    LOW = -1
+    NORMAL = 0
+    HIGH = 1
+
+
 class ErrorKind(StrEnum):
     """Why a job failed: stable words for programs; the message is for people."""
 
@@ -60,7 +71,8 @@ class Exit(IntEnum):
     CANNOT_RECONSTRUCT = 11
     OUT_OF_MEMORY = 12
     DISK_FULL = 13
-    CANCELLED = 14
+    CANCELLED = 14  # as asked; a result of what there was is in the attempt's folder, if there was any
+    STOPPED = 15  # as asked; the state is kept, if it could be
 
 
 def queue_id(job_id: str, attempt: int) -> str:

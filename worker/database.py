@@ -25,9 +25,6 @@ class Database:
             sa.event.listen(self.engine, "connect", _prepare_sqlite)
             sa.event.listen(self.engine, "begin", _begin_sqlite)
 
-    def create_tables(self) -> None:
-        metadata.create_all(self.engine)
-
     @contextmanager
     def reading(self) -> Iterator[sa.Connection]:
         with self.engine.connect() as connection, connection.begin():

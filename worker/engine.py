@@ -3,6 +3,9 @@
 It knows one folder and nothing else: no database, no Redis, no server. It reads JOBDIR/job.json
 and JOBDIR/scan, says each progress event as one JSON line on stdout, writes the results to
 JOBDIR/attempt-N, and ends with one of `worker.contract.Exit`. An error is its last line.
+
+It keeps its state in JOBDIR/run.checkpoint and goes on from what an earlier attempt left there. SIGTERM asks it to
+keep its state and go; the file JOBDIR/cancel, to make a result of what there is.
 """
 
 from __future__ import annotations
@@ -12,27 +15,25 @@ import errno
 import importlib
 import json
 import os
-import resource
-import signal
 import sys
 import traceback
 from collections.abc import Callable, Generator
 from pathlib import Path
-from types import FrameType
 from typing import Any, TextIO
 
 from splatcore.errors import OptionsError, ReconstructionError, ScanError
+from splatcore.keeper import Stopped, Wish
 from splatcore.options import Options
 from splatcore.progress import Progress
 from worker.contract import Exit
 from worker.jobfolder import JobFolder
 from worker.lifeline import die_with_parent
+from worker.limits import limit_self
+from worker.requests import Requests
 
 Say = Callable[[dict[str, Any]], None]
 
-
-class Cancelled(Exception):
-    """The job was cancelled; raised between two events."""
+_ASKED = {Wish.CONCLUDE: Exit.CANCELLED, Wish.STOP: Exit.STOPPED}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -43,7 +44,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--engine", default="splatcore")
     given = parser.parse_args(arguments)
     die_with_parent(given.parent)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with _private_stdout() as out:
 
         def say(line: dict[str, Any]) -> None:
@@ -51,38 +51,42 @@ def main(arguments: list[str] | None = None) -> int:
             out.flush()
 
         try:
-            _work(JobFolder(given.job.parent.parent, given.job.name), given.attempt, given.engine, say)
-        except Cancelled:
-            return Exit.CANCELLED
+            return _work(JobFolder(given.job.parent.parent, given.job.name), given.attempt, given.engine, say)
+        except Stopped:
+            return Exit.STOPPED
         except Exception as error:
             traceback.print_exc()
             code, message = _classify(error)
             say({"error": message})
             return code
-    return Exit.OK
 
 
-def _work(folder: JobFolder, attempt: int, engine: str, say: Say) -> None:
-    options = Options.from_dict(json.loads(folder.spec.read_bytes())["options"])
+def _work(folder: JobFolder, attempt: int, engine: str, say: Say) -> int:
+    spec = json.loads(folder.spec.read_bytes())
+    limit_self(spec.get("memory_mib", 0), spec.get("file_mib", 1 << 20))
+    options = Options.from_dict(spec["options"])
+    requests = _requests(folder, attempt, spec)
     scan = _part(engine, "scan", "read_scan")(folder.scan)
-    events = _part(engine, "reconstruct", "reconstruct")(scan, options)
-    reconstruction = _drive(events, folder.cancel, say)
+    if requests.look() in _ASKED:  # before there was anything to keep
+        return _ASKED[requests.wish]
+    events = _part(engine, "reconstruct", "reconstruct")(scan, options, requests)
+    reconstruction = _drive(events, say)
     _part(engine, "results", "write_results")(reconstruction, folder.attempt(attempt))
+    return Exit.CANCELLED if requests.concluded else Exit.OK
 
 
-def _drive(events: Generator[Progress, None, Any], cancel: Path, say: Say) -> Any:
-    """Run the generator to its end and return its value, looking for a cancellation at each event."""
-    told_to_stop = False
+def _requests(folder: JobFolder, attempt: int, spec: dict[str, Any]) -> Requests:
+    every_s, plan = spec.get("checkpoint_s", 0.0), spec.get("test")
+    if plan is None:
+        return Requests(folder, every_s)
+    from worker.rehearsal import Rehearsal
 
-    def stop(_signal: int, _frame: FrameType | None) -> None:
-        nonlocal told_to_stop
-        told_to_stop = True
+    return Rehearsal(folder, every_s, attempt, plan)
 
-    signal.signal(signal.SIGTERM, stop)
+
+def _drive(events: Generator[Progress, None, Any], say: Say) -> Any:
+    """Run the generator to its end and return its value."""
     while True:
-        if told_to_stop or cancel.exists():
-            events.close()
-            raise Cancelled
         try:
             event = next(events)
         except StopIteration as end:

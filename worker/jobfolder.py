@@ -7,6 +7,8 @@ JOBDIR/cancel         exists: the engine is asked to stop
 JOBDIR/events.jsonl   progress, one JSON object per line
 JOBDIR/log.txt        the engine's stderr
 JOBDIR/attempt-N/     results in the making
+JOBDIR/run.checkpoint the engine's state, from which the next attempt goes on
+JOBDIR/partial/       what a run had when it was cancelled or its time was up; complete like results/
 JOBDIR/results/       published; complete from the moment it exists
 """
 
@@ -73,6 +75,8 @@ class JobFolder:
         self.log = self.path / "log.txt"
         self.scratch = self.path / "tmp"
         self.results = self.path / "results"
+        self.partial = self.path / "partial"
+        self.checkpoint = self.path / "run.checkpoint"
 
     def create(self, scan: Path) -> None:
         """Lay out the folder with the files of the committed scan in it."""
@@ -82,6 +86,12 @@ class JobFolder:
         self.lock_file.touch()
         for folder in (self.scan, self.path, self.path.parent):
             sync_folder(folder)
+
+    def go_on_from(self, earlier: JobFolder) -> None:
+        """Begin with the state that an earlier job of the same scan was left in, if there is one. The engine uses it
+        where the options are the same too."""
+        with contextlib.suppress(FileNotFoundError):
+            link_or_copy(earlier.checkpoint, self.checkpoint)
 
     def become(self, other: JobFolder) -> None:
         """Take the place of `other`, where only a request that was cut short may have left something."""
@@ -112,8 +122,28 @@ class JobFolder:
         shutil.rmtree(self.scratch, ignore_errors=True)
         self.scratch.mkdir()
         self.attempt(number).mkdir()
+        spec = {**spec, "began_with": _stamp(self.checkpoint)}
         write_atomically(self.spec, json.dumps(spec, indent=1).encode())
         return self.attempt(number)
+
+    def advanced(self) -> bool:
+        """Whether the present attempt has kept a state of its own: the next one will begin further on."""
+        try:
+            began_with = json.loads(self.spec.read_bytes()).get("began_with")
+        except (FileNotFoundError, ValueError):
+            return False
+        return _stamp(self.checkpoint) not in (None, began_with)
+
+    def log_tail(self, most: int = 1000) -> str:
+        """The end of the engine's log, whole lines."""
+        try:
+            with self.log.open("rb") as file:
+                size = file.seek(0, os.SEEK_END)
+                file.seek(max(0, size - most))
+                text = file.read().decode(errors="replace")
+        except FileNotFoundError:
+            return ""
+        return (text if size <= most else text.partition("\n")[2]).strip()
 
     def published(self) -> bool:
         """Whether results stand. The folder appears by one rename, its manifest inside."""
@@ -121,27 +151,42 @@ class JobFolder:
 
     def publish(self, number: int) -> None:
         """Make attempt `number` the job's results, durably and in one step."""
-        made = self.attempt(number)
+        self._publish(self.attempt(number), self.results)
+
+    def published_partial(self) -> bool:
+        """Whether a run that was ended early left a result."""
+        return (self.partial / "manifest.json").is_file()
+
+    def publish_partial(self, number: int) -> bool:
+        """Keep what attempt `number` had made when it was asked to end; False if it had made nothing whole."""
+        made = self.results if self.published() else self.attempt(number)
+        if not (made / "manifest.json").is_file():
+            return False
+        shutil.rmtree(self.partial, ignore_errors=True)
+        self._publish(made, self.partial)
+        return True
+
+    def _publish(self, made: Path, goal: Path) -> None:
         for file in made.iterdir():
             sync_file(file)
         sync_folder(made)
-        made.rename(self.results)
+        made.rename(goal)
         sync_folder(self.path)
 
     def discard_attempts(self) -> None:
         for left in self.path.glob("attempt-*"):
             shutil.rmtree(left, ignore_errors=True)
 
-    def discard_results(self) -> None:
-        self.discard_attempts()
-        shutil.rmtree(self.results, ignore_errors=True)
-
     def tidy(self) -> None:
-        """After the end: drop what only a running job needs. The scan is kept by the scan store."""
+        """After the end: drop what only a running job needs. The scan is kept by the scan store; the state, without
+        which a restart would begin anew, where there are no results."""
         self.discard_attempts()
         shutil.rmtree(self.scratch, ignore_errors=True)
         shutil.rmtree(self.scan, ignore_errors=True)
         self.cancel.unlink(missing_ok=True)
+        if self.published():
+            self.checkpoint.unlink(missing_ok=True)
+        self.checkpoint.with_name(f".{self.checkpoint.name}.part").unlink(missing_ok=True)
 
     def remove(self) -> None:
         """Delete everything. Renamed first, so that a half-deleted folder is never taken for a job."""
@@ -149,6 +194,15 @@ class JobFolder:
         with contextlib.suppress(FileNotFoundError):
             self.path.rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
+
+
+def _stamp(file: Path) -> list[int] | None:
+    """Another for every file that takes the name; None where there is none."""
+    try:
+        found = file.stat()
+    except FileNotFoundError:
+        return None
+    return [found.st_ino, found.st_mtime_ns, found.st_size]
 
 
 def _flock(descriptor: int, wait_s: float) -> bool:

@@ -14,8 +14,9 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from worker.contract import ACTIVE, FINISHED, MAX_CRASHES, TRANSITIONS, ErrorKind, State
+from worker.contract import ACTIVE, FINISHED, LOCAL_TENANT, MAX_CRASHES, TRANSITIONS, ErrorKind, Priority, State
 from worker.database import Database, metadata
+from worker.outbox import announce
 
 _STATE = sa.Enum(State, native_enum=False, length=16, values_callable=lambda states: [s.value for s in states])
 
@@ -41,6 +42,12 @@ jobs = sa.Table(
     sa.Column("created_at", sa.Float, nullable=False, index=True),  # seconds since 1970, UTC
     sa.Column("started_at", sa.Float),
     sa.Column("finished_at", sa.Float),
+    sa.Column("tenant", sa.String(64), nullable=False, server_default=LOCAL_TENANT),
+    sa.Column("priority", sa.Integer, nullable=False, server_default=sa.text("0")),  # worker.contract.Priority
+    sa.Column("partial", sa.Boolean, nullable=False, server_default=sa.false()),  # it left a partial result
+    sa.Column("restart_of", sa.String(36)),  # the job that it was made from
+    sa.Index("ix_jobs_tenant_created_at", "tenant", "created_at"),
+    sa.Index("ix_jobs_tenant_started_at", "tenant", "started_at"),
 )
 
 
@@ -67,27 +74,46 @@ class Job:
     created_at: float
     started_at: float | None
     finished_at: float | None
+    tenant: str
+    priority: int
+    partial: bool
+    restart_of: str | None
 
 
 class Ledger:
-    """Reads and changes jobs. Methods that change one return whether the change took place."""
+    """Reads and changes jobs. Methods that change one return whether the change took place.
 
-    def __init__(self, database: Database) -> None:
+    With a `tenant` it knows that one's jobs and no others; without, as workers and the server's own loops
+    use it, all.
+    """
+
+    def __init__(self, database: Database, tenant: str | None = None) -> None:
         self._database = database
+        self._tenant = tenant
 
-    def add(self, write: sa.Connection, job_id: str, name: str, scan: tuple[str, str], options: dict[str, Any]) -> None:
+    def add(
+        self,
+        write: sa.Connection,
+        job_id: str,
+        name: str,
+        scan: tuple[str, str],
+        options: dict[str, Any],
+        priority: Priority = Priority.NORMAL,
+        restart_of: str | None = None,
+    ) -> None:
         """Insert a queued job within the caller's transaction. `scan` is (id, name)."""
-        row = {"id": job_id, "name": name, "scan_id": scan[0], "scan_name": scan[1], "options": options}
+        row: dict[str, Any] = {"id": job_id, "name": name, "scan_id": scan[0], "scan_name": scan[1], "options": options}
+        row |= {"tenant": self._tenant or LOCAL_TENANT, "priority": int(priority), "restart_of": restart_of}
         write.execute(jobs.insert().values(**row, state=State.QUEUED, message="Waiting", created_at=time.time()))
 
     def get(self, job_id: str) -> Job | None:
         with self._database.reading() as read:
-            row = read.execute(sa.select(jobs).where(jobs.c.id == job_id)).one_or_none()
+            row = read.execute(sa.select(jobs).where(jobs.c.id == job_id, self._mine())).one_or_none()
         return None if row is None else _job(row)
 
     def page(self, state: State | None, limit: int, before: Job | None) -> list[Job]:
         """Jobs, newest first, older than `before`."""
-        query = sa.select(jobs).order_by(jobs.c.created_at.desc(), jobs.c.id.desc()).limit(limit)
+        query = sa.select(jobs).where(self._mine()).order_by(jobs.c.created_at.desc(), jobs.c.id.desc()).limit(limit)
         if state is not None:
             query = query.where(jobs.c.state == state)
         if before is not None:
@@ -106,18 +132,54 @@ class Ledger:
         with self._database.reading() as read:
             return [_job(row) for row in read.execute(sa.select(jobs).where(jobs.c.id.in_(ids)))]
 
-    def queue(self) -> list[str]:
-        """The ids of the queued jobs in the order of `position`."""
-        query = sa.select(jobs.c.id).where(jobs.c.state == State.QUEUED).order_by(jobs.c.created_at, jobs.c.id)
+    def positions(self) -> dict[str, int]:
+        """The place of every queued job among its tenant's, 1 for the one that is next: how many others wait is
+        theirs to know."""
         with self._database.reading() as read:
-            return list(read.execute(query).scalars())
+            query = sa.select(jobs.c.id, _place()).where(jobs.c.state == State.QUEUED)
+            return {job_id: int(number) for job_id, number in read.execute(query)}
 
     def position(self, job: Job) -> int:
-        """1 for the queued job that is next."""
-        ahead = sa.tuple_(jobs.c.created_at, jobs.c.id) < (job.created_at, job.id)
+        """That of one queued job."""
+        before = sa.or_(
+            jobs.c.priority > job.priority,
+            sa.and_(
+                jobs.c.priority == job.priority,
+                sa.tuple_(jobs.c.created_at, jobs.c.id) < (job.created_at, job.id),
+            ),
+        )
+        ahead = sa.and_(jobs.c.tenant == job.tenant, before)
         query = sa.select(sa.func.count()).select_from(jobs).where(jobs.c.state == State.QUEUED, ahead)
         with self._database.reading() as read:
             return int(read.execute(query).scalar_one()) + 1
+
+    def line(self, limit: int) -> list[Job]:
+        """The queued jobs that are next, in order: within a tenant by priority, then by age. Between tenants the one
+        with the fewest jobs at work, each waiting one counted to those before it; of equals the one that was served
+        the longest time ago. So a tenant with a thousand jobs keeps nobody else waiting for more than one."""
+        at_work = (
+            sa.select(jobs.c.tenant, sa.func.count().label("jobs"))
+            .where(jobs.c.state.in_([State.RUNNING, State.CANCELLING]))
+            .group_by(jobs.c.tenant)
+            .subquery()
+        )
+        served = sa.select(jobs.c.tenant, sa.func.max(jobs.c.started_at).label("at")).group_by(jobs.c.tenant).subquery()
+        waiting = sa.select(jobs.c.id, _place().label("place")).where(jobs.c.state == State.QUEUED).subquery()
+        query = (
+            sa.select(jobs)
+            .join(waiting, waiting.c.id == jobs.c.id)
+            .outerjoin(at_work, at_work.c.tenant == jobs.c.tenant)
+            .outerjoin(served, served.c.tenant == jobs.c.tenant)
+            .order_by(
+                waiting.c.place + sa.func.coalesce(at_work.c.jobs, 0),
+                sa.func.coalesce(served.c.at, 0),
+                jobs.c.created_at,
+                jobs.c.id,
+            )
+            .limit(limit)
+        )
+        with self._database.reading() as read:
+            return [_job(row) for row in read.execute(query)]
 
     def needs_scan(self, read: sa.Connection, scan_id: str) -> bool:
         query = sa.select(jobs.c.id).where(jobs.c.scan_id == scan_id, jobs.c.state.in_(list(ACTIVE))).limit(1)
@@ -144,23 +206,41 @@ class Ledger:
         end = {"stage": "done", "message": "Done", "progress": 1.0}
         return self._move(job_id, attempt, State.RUNNING, State.SUCCEEDED, **end)
 
-    def fail(self, job_id: str, attempt: int, kind: ErrorKind, message: str, was: State = State.RUNNING) -> bool:
-        error = {"error_kind": kind.value, "error_message": message, "message": "Failed"}
+    def fail(
+        self,
+        job_id: str,
+        attempt: int,
+        kind: ErrorKind,
+        message: str,
+        was: State = State.RUNNING,
+        partial: bool = False,
+    ) -> bool:
+        error = {"error_kind": kind.value, "error_message": message, "message": "Failed", "partial": partial}
         return self._move(job_id, attempt, was, State.FAILED, **error)
 
-    def end_cancel(self, job_id: str, attempt: int) -> bool:
-        return self._move(job_id, attempt, State.CANCELLING, State.CANCELLED, message="Cancelled")
+    def end_cancel(self, job_id: str, attempt: int, partial: bool = False) -> bool:
+        message = "Cancelled; what there was is kept as a partial result" if partial else "Cancelled"
+        return self._move(job_id, attempt, State.CANCELLING, State.CANCELLED, message=message, partial=partial)
 
     def hand_back(self, job_id: str, attempt: int) -> bool:
         """Queue the job again because its worker was told to stop: nobody's fault, not counted."""
         return self._requeue(job_id, attempt, "Its worker was stopped; waiting for another")
 
-    def crashed(self, job: Job, what: str) -> bool:
-        """Queue the job again after its attempt died, or fail it if that happened too often."""
-        if job.crashes + 1 < MAX_CRASHES:
-            return self._requeue(job.id, job.attempt, f"{what}; waiting to start again", crashes=job.crashes + 1)
-        message = f"{what}, {job.crashes + 1} times. The machine may be short of memory; the log may say more."
-        return self.fail(job.id, job.attempt, ErrorKind.CRASHED, message)
+    def crashed(self, job: Job, what: str, advanced: bool = False, log_tail: str = "") -> State | None:
+        """Queue the job again after its attempt died, or fail it if that happened too often. Returns what became of it,
+        None if it is no longer that attempt's.
+
+        advanced: the attempt kept a state that the next one goes on from; so it was not this job that is to blame, or
+        at least it does not die at one place for ever.
+        """
+        crashes = 1 if advanced else job.crashes + 1
+        if crashes < MAX_CRASHES:
+            again = self._requeue(job.id, job.attempt, f"{what}; waiting to go on", crashes=crashes)
+            return State.QUEUED if again else None
+        message = f"{what}, {crashes} times without getting further. Restart the job when the cause is gone."
+        if log_tail:
+            message += f" Its log ends with:\n{log_tail}"
+        return State.FAILED if self.fail(job.id, job.attempt, ErrorKind.CRASHED, message) else None
 
     def ask_cancel(self, job_id: str) -> Job | None:
         """Cancel a queued job at once, ask for it when running, leave a finished one alone."""
@@ -176,9 +256,12 @@ class Ledger:
 
     def forget(self, job_id: str) -> bool:
         """Delete the row of a finished job."""
-        done = sa.and_(jobs.c.id == job_id, jobs.c.state.in_(list(FINISHED)))
+        done = sa.and_(jobs.c.id == job_id, self._mine(), jobs.c.state.in_(list(FINISHED)))
         with self._database.writing() as write:
             return write.execute(jobs.delete().where(done)).rowcount == 1
+
+    def _mine(self) -> sa.ColumnElement[bool]:
+        return sa.true() if self._tenant is None else jobs.c.tenant == self._tenant
 
     def _requeue(self, job_id: str, attempt: int, message: str, **values: Any) -> bool:
         fresh = {"stage": "", "progress": 0.0, "eta_s": None, "host": None, "heartbeat": None}
@@ -191,7 +274,24 @@ class Ledger:
             values = {"finished_at": time.time(), "eta_s": None, **values}
         expected = sa.and_(jobs.c.id == job_id, jobs.c.attempt == attempt, jobs.c.state == old)
         with self._database.writing() as write:
-            return write.execute(jobs.update().where(expected).values(state=new, **values)).rowcount == 1
+            moved = write.execute(jobs.update().where(expected).values(state=new, **values)).rowcount == 1
+            if moved and new in FINISHED:
+                job = _job(write.execute(sa.select(jobs).where(jobs.c.id == job_id)).one())
+                announce(write, job.tenant, f"job.{new}", _told(job))
+            return moved
+
+
+def _told(job: Job) -> dict[str, Any]:
+    """What webhooks hear of a job."""
+    error = None if job.error_kind is None else {"kind": job.error_kind, "message": job.error_message}
+    names = {"id": job.id, "name": job.name, "scan_id": job.scan_id, "scan_name": job.scan_name}
+    return {**names, "state": job.state, "error": error}
+
+
+def _place() -> sa.ColumnElement[int]:
+    """The order of a tenant's queued jobs, from 1."""
+    order = [jobs.c.priority.desc(), jobs.c.created_at, jobs.c.id]
+    return sa.func.row_number().over(partition_by=jobs.c.tenant, order_by=order)
 
 
 def _job(row: sa.Row[Any]) -> Job:

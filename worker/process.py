@@ -12,11 +12,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from splatcore.machine import threads_allowed
 from worker.jobfolder import JobFolder
 
 # What the engine may know of its surroundings. Never a database or Redis URL.
 _INHERITED = ("PATH", "HOME", "LANG", "TZ", "LD_LIBRARY_PATH", "PYTHONSAFEPATH", "PYTHONDONTWRITEBYTECODE")
 _INHERITED_PREFIXES = ("LC_", "OMP_", "MKL_", "OPENBLAS_", "CUDA_", "NVIDIA_", "TORCH_", "SPLATCORE_")
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # they know no cgroup quota
 
 _LONGEST_LINE = 1 << 20
 
@@ -32,7 +35,8 @@ def import_path() -> str:
 def clean_environment(scratch: Path | None = None) -> dict[str, str]:
     """An environment for a process that handles user data: scrubbed, with absolute import paths."""
     kept = {k: v for k, v in os.environ.items() if k in _INHERITED or k.startswith(_INHERITED_PREFIXES)}
-    return {**kept, "PYTHONPATH": import_path(), **({} if scratch is None else {"TMPDIR": str(scratch)})}
+    threads = {name: str(threads_allowed()) for name in _THREADS if name not in kept}
+    return {**kept, **threads, "PYTHONPATH": import_path(), **({} if scratch is None else {"TMPDIR": str(scratch)})}
 
 
 class EngineProcess:

@@ -24,11 +24,13 @@ from worker.jobfolder import JobFolder
 from worker.journal import EventWriter
 from worker.ledger import Job, Ledger
 from worker.lifeline import die_with_parent, host_id
+from worker.oom import OomWatch
 from worker.process import EngineProcess
 from worker.settings import WorkerSettings
 
 log = logging.getLogger("splatct.worker")
 
+IN_LINE = 20  # jobs to try for; more workers than that never ask at one moment
 LOCK_WAIT_S = 3.0  # an engine that was just killed needs a moment to let go
 TICK_S = 0.5
 DATABASE_PATIENCE_S = 600.0
@@ -40,6 +42,11 @@ _ERRORS = {
     Exit.OUT_OF_MEMORY: ErrorKind.OUT_OF_MEMORY,
     Exit.DISK_FULL: ErrorKind.DISK_FULL,
 }
+
+_OUT_OF_MEMORY = (
+    "The kernel ended the engine for want of memory. Try quality preview, fewer splats or a smaller volume, or a "
+    "machine with more memory."
+)
 
 
 class Lost(Exception):
@@ -57,7 +64,10 @@ class StopFlag:
 
 
 def run_job(job_id: str, attempt: int) -> None:
-    """Entry point for RQ. Says nothing to RQ: the ledger is where outcomes go."""
+    """Entry point for RQ. Says nothing to RQ: the ledger is where outcomes go.
+
+    What the queue names is only a sign that a job waits; which one is next the ledger says.
+    """
     assert "torch" not in sys.modules, "the worker process must stay light; only the engine imports torch"
     worker = os.environ.get("SPLATCT_WORKER_PID")
     if worker is not None:
@@ -65,26 +75,38 @@ def run_job(job_id: str, attempt: int) -> None:
     settings = WorkerSettings()
     database = Database(settings.database)
     try:
-        supervise(settings, Ledger(database), job_id, attempt)
+        log.debug("woken for job %s, attempt %d", job_id, attempt)
+        work_on_next(settings, Ledger(database))
     finally:
         database.close()
 
 
-def supervise(settings: WorkerSettings, ledger: Ledger, job_id: str, attempt: int) -> None:
-    """Claim the attempt and see it through; return quietly when it is not to be had."""
+def work_on_next(settings: WorkerSettings, ledger: Ledger) -> bool:
+    """See the next job in line through; False if none is to be had. Others take jobs at the same time: whom another
+    has is passed over. The first is asked for again with patience, as its last engine may just be dying."""
+    line = ledger.line(IN_LINE)
+    tries = [(job, 0.0) for job in line] + [(job, LOCK_WAIT_S) for job in line[:1]]
+    return any(supervise(settings, ledger, job.id, job.attempt, patience_s) for job, patience_s in tries)
+
+
+def supervise(
+    settings: WorkerSettings, ledger: Ledger, job_id: str, attempt: int, patience_s: float = LOCK_WAIT_S
+) -> bool:
+    """Claim the attempt and see it through; False, and nothing done, when it is not to be had."""
     stop = StopFlag()
     signal.signal(signal.SIGTERM, stop)
     folder = JobFolder(settings.data.absolute(), job_id)
-    with folder.lock(LOCK_WAIT_S) as lock:
+    with folder.lock(patience_s) as lock:
         if lock is None or stop.set:
-            return  # deleted, or another process still works on it: the reconcile loop will ask again
+            return False  # deleted, or another process still works on it: the reconcile loop will ask again
         job = ledger.claim(job_id, attempt, host_id())
         if job is None:
-            return
+            return False
         try:
             _Attempt(settings, ledger, folder, job, lock, stop).run()
         except Lost:
             log.warning("job %s: attempt %d is no longer ours", job_id, attempt)
+        return True
 
 
 class _Attempt:
@@ -102,14 +124,22 @@ class _Attempt:
         self._error = ""
         self._cancelling_since: float | None = None
         self._stop = stop
+        self._stopping_since: float | None = None
         self._timed_out = False
+        self._killed_by_us = False
+        self._memory = OomWatch()
 
     def run(self) -> None:
         if self._folder.published():  # an earlier attempt got this far and died before saying so
             self._record_success()
             return
         job = self._job
-        spec = {"id": job.id, "attempt": job.attempt, "options": job.options}
+        settings = self._settings
+        spec = {
+            "id": job.id, "attempt": job.attempt, "options": job.options, "checkpoint_s": settings.checkpoint_s,
+            "memory_mib": settings.engine_memory_mib, "file_mib": settings.engine_file_mib,
+            "test": settings.test_plan,
+        }  # fmt: skip
         self._folder.prepare(spec, job.attempt)
         with EventWriter(self._folder.events) as events:
             if job.attempt > 1:
@@ -126,15 +156,26 @@ class _Attempt:
         while not engine.ended():
             for event in engine.read(TICK_S / 2):
                 self._take(event, events)
-            if self._stop.set:
-                engine.signal(signal.SIGKILL)
-                continue
             now = time.monotonic()
+            if self._stop.set:
+                self._drain(engine, now)
             if now - self._beaten >= (TICK_S if self._news else HEARTBEAT_S / 2):
                 self._beat(now)
             self._heed_limits(engine, now)
         for event in engine.read(0):
             self._take(event, events)
+
+    def _drain(self, engine: EngineProcess, now: float) -> None:
+        """Our worker is to go: ask the engine to keep its state, and wait for that no longer than we may."""
+        if self._stopping_since is None:
+            self._stopping_since = now
+            engine.signal(signal.SIGTERM)
+        elif now - self._stopping_since > self._settings.drain_grace_s:
+            self._kill(engine)
+
+    def _kill(self, engine: EngineProcess) -> None:
+        self._killed_by_us = True
+        engine.signal(signal.SIGKILL)
 
     def _take(self, event: dict[str, Any], events: EventWriter) -> None:
         if "error" in event:
@@ -143,7 +184,8 @@ class _Attempt:
         event = {**event, "attempt": self._job.attempt}
         events.append(event)
         fraction = min(1.0, max(0.0, float(event.get("fraction", 0.0))))
-        spent = time.monotonic() - self._started
+        # The engine's own clock counts what earlier attempts have done of it.
+        spent = float(event.get("seconds") or time.monotonic() - self._started)
         self._news = {
             "stage": str(event.get("stage", ""))[:32],
             "message": str(event.get("message", "")),
@@ -166,22 +208,20 @@ class _Attempt:
             self._folder.cancel.touch()
 
     def _heed_limits(self, engine: EngineProcess, now: float) -> None:
-        """Escalate a cancellation, or a job that takes too long: ask, terminate, kill."""
+        """End a cancelled job, and one that takes too long: ask for a result of what there is, then kill.
+
+        The clock is ours and SIGKILL needs no consent, so this holds while the engine is deep in native code."""
         if not self._timed_out and now - self._started > self._settings.job_seconds:
             self._timed_out = True
             self._folder.cancel.touch()
             self._cancelling_since = self._cancelling_since or now
-        if self._cancelling_since is not None:
-            waited = now - self._cancelling_since
-            if waited > 2 * self._settings.cancel_grace_s:
-                engine.signal(signal.SIGKILL)
-            elif waited > self._settings.cancel_grace_s:
-                engine.signal(signal.SIGTERM)
+        if self._cancelling_since is not None and now - self._cancelling_since > self._settings.cancel_grace_s:
+            self._kill(engine)
 
     def _conclude(self, code: int) -> None:
         """Turn the engine's end into the job's."""
         job, ledger = self._job, self._ledger
-        if code == Exit.OK and not self._timed_out:
+        if code == Exit.OK:
             self._publish()
             return
         state = self._insist_on_state()
@@ -189,16 +229,23 @@ class _Attempt:
             self._record_cancel()
         elif self._timed_out:
             limit = f"{self._settings.job_seconds / 3600:.3g} h"
-            ledger.fail(job.id, job.attempt, ErrorKind.TIMEOUT, f"The job was stopped at its time limit of {limit}.")
-        elif self._stop.set or code == Exit.CANCELLED:  # the latter: somebody terminated the engine politely
+            partial = self._folder.publish_partial(job.attempt)
+            kept = " What there was is kept as a partial result." if partial else ""
+            message = f"The job was stopped at its time limit of {limit}.{kept}"
+            ledger.fail(job.id, job.attempt, ErrorKind.TIMEOUT, message, partial=partial)
+        elif self._stop.set or code in (Exit.STOPPED, Exit.CANCELLED):  # without us: somebody terminated it politely
             ledger.hand_back(job.id, job.attempt)
             return
         elif code in _ERRORS:
             message = self._error or "The engine failed. The log holds the details."
             ledger.fail(job.id, job.attempt, _ERRORS[Exit(code)], message)
+        elif code == -signal.SIGKILL and not self._killed_by_us and self._memory.killed():
+            ledger.fail(job.id, job.attempt, ErrorKind.OUT_OF_MEMORY, _OUT_OF_MEMORY)
         else:
-            ledger.crashed(job, _obituary(code))
-            return
+            folder = self._folder
+            end = ledger.crashed(job, _obituary(code), advanced=folder.advanced(), log_tail=folder.log_tail())
+            if end is not State.FAILED:
+                return
         self._folder.tidy()
 
     def _publish(self) -> None:
@@ -219,8 +266,8 @@ class _Attempt:
         self._folder.tidy()
 
     def _record_cancel(self) -> None:
-        self._folder.discard_results()
-        self._ledger.end_cancel(self._job.id, self._job.attempt)
+        partial = self._folder.publish_partial(self._job.attempt)
+        self._ledger.end_cancel(self._job.id, self._job.attempt, partial)
         self._folder.tidy()
 
     def _insist_on_state(self) -> State:

@@ -11,10 +11,13 @@ from uuid import uuid4
 
 import httpx
 
+from splatct_client.credentials import checked
 from splatct_client.download import fetch_file
 from splatct_client.errors import (
+    ClientError,
     InputError,
     IntegrityError,
+    KeyNeeded,
     Problem,
     ServerProblem,
     ServerUnreachable,
@@ -44,6 +47,7 @@ class Client:
         self,
         base_url: str,
         *,
+        key: str | None = None,
         patience: Patience | None = None,
         timeout_s: float = 60.0,
         transport: httpx.BaseTransport | None = None,
@@ -51,16 +55,23 @@ class Client:
         address = urlsplit(base_url)
         if address.scheme not in ("http", "https") or not address.hostname:
             raise InputError(f"server: got {base_url!r}, expected an address such as http://127.0.0.1:8080")
+        if "@" in address.netloc:  # not repeated: addresses end up in logs and in what is printed
+            raise InputError("server: the address holds a user's name or a secret; a key goes into --key-file")
         self.base_url = base_url.rstrip("/")
         self.patience = patience or Patience()
         self._reached = False
         self._wait_s = min(LONGEST_WAIT_S, timeout_s / 2)
+        headers = {"User-Agent": "splatct-client/1", "Accept": "application/json"}
+        if key is not None:
+            headers["Authorization"] = f"Bearer {checked(key, 'key')}"
+        self._has_key = key is not None
         self._http = httpx.Client(
             base_url=self.base_url,
+            follow_redirects=False,  # the key is for this address alone
             timeout=httpx.Timeout(timeout_s, connect=min(10.0, timeout_s)),
             transport=transport,
             trust_env=address.hostname not in LOOPBACK,  # no proxy to oneself
-            headers={"User-Agent": "splatct-client/1", "Accept": "application/json"},
+            headers=headers,
         )
 
     def __enter__(self) -> Self:
@@ -127,10 +138,19 @@ class Client:
         """Every reconstruction option the server knows: name, default, choices, range, help."""
         return _items(self._json("GET", "/v1/options"), "options")
 
-    def submit(self, scan_id: str, options: dict[str, Any] | None = None, name: str | None = None) -> Job:
+    def submit(
+        self,
+        scan_id: str,
+        options: dict[str, Any] | None = None,
+        name: str | None = None,
+        priority: str | None = None,
+    ) -> Job:
+        """priority: low, normal or high among one's own jobs."""
         body: dict[str, Any] = {"scan_id": scan_id, "options": options or {}}
         if name is not None:
             body["name"] = name
+        if priority is not None:
+            body["priority"] = priority
         try:  # under an id of our own it can be repeated until there is an answer, and there is one job
             return Job.from_json(self._json("PUT", f"/v1/jobs/{uuid4()}", json=body))
         except ServerProblem as problem:
@@ -180,18 +200,22 @@ class Client:
 
     # Results
 
-    def results(self, job_id: str) -> list[ResultFile]:
+    # `kind` is "results", or "partial": what a job had when it was cancelled or its time was up.
+
+    def results(self, job_id: str, kind: str = "results") -> list[ResultFile]:
         """The files a finished job left, with size and sha256."""
-        manifest = self._json("GET", f"/v1/jobs/{_id(job_id)}/results")
+        manifest = self._json("GET", f"/v1/jobs/{_id(job_id)}/{kind}")
         return [ResultFile.from_json(file) for file in _items(manifest, "files")]
 
-    def manifest(self, job_id: str) -> bytes:
+    def manifest(self, job_id: str, kind: str = "results") -> bytes:
         """manifest.json itself, which cannot list its own sha256."""
-        return self._request("GET", f"/v1/jobs/{_id(job_id)}/results/manifest.json").content
+        return self._request("GET", f"/v1/jobs/{_id(job_id)}/{kind}/manifest.json").content
 
-    def download(self, job_id: str, file: ResultFile, folder: Path, on_bytes: OnBytes | None = None) -> Path:
+    def download(
+        self, job_id: str, file: ResultFile, folder: Path, on_bytes: OnBytes | None = None, kind: str = "results"
+    ) -> Path:
         """Fetch one result file into `folder`: resumed, checked, and there under its name only when whole."""
-        return fetch_file(self, f"/v1/jobs/{_id(job_id)}/results/{_name(file.name)}", file, folder, on_bytes)
+        return fetch_file(self, f"/v1/jobs/{_id(job_id)}/{kind}/{_name(file.name)}", file, folder, on_bytes)
 
     # The wire
 
@@ -210,10 +234,10 @@ class Client:
         response = self._http.send(
             self._http.build_request("GET", url, headers={"Accept-Encoding": "identity", **headers}), stream=True
         )
-        if response.is_error and response.status_code != 416:
+        if (response.is_error and response.status_code != 416) or response.has_redirect_location:
             response.read()
             response.close()
-            raise _problem(response)
+            raise self._refusal(response)
         return response
 
     def _json(self, method: str, url: str, **kwargs: Any) -> Any:
@@ -248,11 +272,21 @@ class Client:
                     raise ServerUnreachable(self.base_url, error) from error
                 continue
             self._reached = True
-            if not response.is_error:
+            if not response.is_error and not response.has_redirect_location:
                 return response
             again = response.status_code in (RETRIED_STATUS if repeatable else NEVER_DONE_STATUS)
             if not again or not attempts.pause(retry_after_s(response.headers.get("Retry-After"))):
-                raise _problem(response)
+                raise self._refusal(response)
+
+    def _refusal(self, response: httpx.Response) -> ClientError:
+        if response.has_redirect_location:
+            return UnexpectedAnswer(
+                f"{self.base_url} sends on to another address, which is not followed: the key is for this one alone; "
+                "give the server's final address with --server URL or SPLATCT_SERVER"
+            )
+        if response.status_code == 401 and not self._has_key:
+            return KeyNeeded(self.base_url)
+        return _problem(response)
 
 
 def _id(text: str) -> str:

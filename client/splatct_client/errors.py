@@ -4,6 +4,7 @@ SplatCTError          the name by which the command line knows an error meant fo
   ClientError
     InputError        what was given cannot be used: a wrong folder, a missing file
     ServerUnreachable nobody answers at the address
+    KeyNeeded         the server lets nobody in without a key
     ServerProblem     the server answered with problem+json; `problems` lists all of it
     UnexpectedAnswer  the answer is not what version 1 of the API promises
     IntegrityError    bytes differ from their sha256
@@ -61,6 +62,16 @@ class ServerUnreachable(ClientError):
         super().__init__(
             f"no SplatCT server answers at {base_url} ({str(cause) or type(cause).__name__}). "
             "Start one with `splatct up`, or name another with --server URL or SPLATCT_SERVER."
+        )
+
+
+class KeyNeeded(ClientError):
+    """The server asks for a key, and none was given."""
+
+    def __init__(self, base_url: str) -> None:
+        super().__init__(
+            f"the server at {base_url} asks for a key: name the file that holds it with --key-file FILE, or set "
+            "SPLATCT_KEY. Who runs the server makes one with `splatct keys add`."
         )
 
 

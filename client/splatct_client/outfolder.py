@@ -25,9 +25,11 @@ def check_out_folder(folder: Path, *, overwrite: bool, job_id: str | None = None
     raise InputError(f"{folder} is not empty; give another folder, or --overwrite to replace the files in it")
 
 
-def fetch_results(client: Client, job_id: str, folder: Path, only: list[str] | None = None) -> list[Path]:
+def fetch_results(
+    client: Client, job_id: str, folder: Path, only: list[str] | None = None, kind: str = "results"
+) -> list[Path]:
     """Download every result file (or those named in `only`), manifest.json last: where it is, all is."""
-    files = [file for file in client.results(job_id) if file.name != "manifest.json"]
+    files = [file for file in client.results(job_id, kind) if file.name != "manifest.json"]
     if only:
         missing = sorted(set(only) - {file.name for file in files})
         if missing:
@@ -40,16 +42,16 @@ def fetch_results(client: Client, job_id: str, folder: Path, only: list[str] | N
         (folder / MARKER).write_text(job_id)
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {error.strerror}") from error
-    paths = _fetch_all(client, job_id, files, folder)
+    paths = _fetch_all(client, job_id, files, folder, kind)
     if not only:
         part = folder / "manifest.json.part"
-        part.write_bytes(client.manifest(job_id))
+        part.write_bytes(client.manifest(job_id, kind))
         paths.append(part.replace(folder / "manifest.json"))
     (folder / MARKER).unlink(missing_ok=True)
     return paths
 
 
-def _fetch_all(client: Client, job_id: str, files: list[ResultFile], folder: Path) -> list[Path]:
+def _fetch_all(client: Client, job_id: str, files: list[ResultFile], folder: Path, kind: str) -> list[Path]:
     total, done, paths = sum(file.size for file in files), 0, []
     with Bar("fetch ") as bar:
         for file in files:
@@ -58,6 +60,6 @@ def _fetch_all(client: Client, job_id: str, files: list[ResultFile], folder: Pat
                 at = before + received
                 bar.show(at / max(total, 1), f"{size_text(at)} of {size_text(total)}  {name}")
 
-            paths.append(client.download(job_id, file, folder, show))
+            paths.append(client.download(job_id, file, folder, show, kind))
             done += file.size
     return paths

@@ -2,10 +2,31 @@
 
 import { byId, setText } from "./dom.js";
 
-export async function call(path, init = {}) {
-  const response = await fetch(path, { headers: { Accept: "application/json" }, ...init });
+let csrf = null; // what shows the server that a request is this page's own; null where there is no session
+
+export async function session() {
+  const mine = await call("/v1/session");
+  csrf = mine.csrf;
+  return mine;
+}
+
+export async function signIn(key) {
+  const body = JSON.stringify({ key });
+  const headers = { Accept: "application/json", "Content-Type": "application/json" };
+  const response = await fetch("/v1/session", { method: "POST", headers, body });
   if (!response.ok) throw await problem(response);
-  return response.json();
+}
+
+export async function call(path, init = {}) {
+  const headers = { Accept: "application/json" };
+  if (init.method) {
+    if (csrf === null) await session();
+    if (csrf !== null) headers["X-CSRF-Token"] = csrf;
+  }
+  const response = await fetch(path, { headers, ...init });
+  if (response.status === 401) location.assign(`/sign-in?next=${encodeURIComponent(location.pathname)}`);
+  if (!response.ok) throw await problem(response);
+  return response.status === 204 ? null : response.json();
 }
 
 async function problem(response) {

@@ -35,7 +35,8 @@ function show(job) {
 }
 
 function showStages(stage) {
-  const now = STAGES.findIndex(([name]) => name === (stage === "poses" ? "level" : stage)); // the two take turns
+  const shown = ["poses", "refine", "checkpoint"].includes(stage) ? "level" : stage; // they take turns, or tell of it
+  const now = STAGES.findIndex(([name]) => name === shown);
   const nodes = STAGES.map(([, text], index) =>
     el("li", { class: index < now ? "past" : index === now ? "now" : "ahead", "aria-current": index === now ? "step" : null }, text),
   );
@@ -59,10 +60,12 @@ function showDetails(job) {
   byId("details").hidden = false;
 }
 
-async function showResults() {
-  const manifest = await call(`${url}/results`);
+async function showResults(kind) {
+  const manifest = await call(`${url}/${kind}`);
   const files = manifest.files;
-  const path = (file) => `${url}/results/${file.name.split("/").map(encodeURIComponent).join("/")}`;
+  if (kind === "partial") setText(byId("fetch-command"), `splatct fetch ${id} --partial -o RESULTS`);
+  setText(byId("files-heading"), kind === "partial" ? "Files of the partial result" : "Files");
+  const path = (file) => `${url}/${kind}/${file.name.split("/").map(encodeURIComponent).join("/")}`;
   byId("file-rows").replaceChildren(
     ...[...files, { name: "manifest.json" }].map((file) =>
       el(
@@ -93,15 +96,16 @@ async function refresh() {
     await live.refresh();
     byId("live").hidden = finished(job) && live.last === 0;
   }
-  if (job.state === "succeeded" && !resultsShown) {
-    await showResults();
+  const kind = job.state === "succeeded" ? "results" : job.links?.partial ? "partial" : null;
+  if (kind && !resultsShown) {
+    await showResults(kind);
     resultsShown = true;
   }
   return finished(job) ? null : 2000;
 }
 
 async function cancel() {
-  if (!confirm("Cancel this job? What it has computed so far is lost.")) return;
+  if (!confirm("Cancel this job? What it has computed so far is kept as a partial result.")) return;
   try {
     show(await call(`${url}/cancel`, { method: "POST" }));
   } catch (error) {

@@ -10,7 +10,9 @@ HELP = "run the HTTP service (workers are started separately)"
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, help="the data folder (SPLATCT_DATA, default ./splatct-data)")
-    parser.add_argument("--host", help="loopback address to listen on (SPLATCT_HOST, default 127.0.0.1)")
+    parser.add_argument(
+        "--host", help="address to listen on (SPLATCT_HOST, default 127.0.0.1); beyond loopback only with keys"
+    )
     parser.add_argument("--port", type=int, help="port to listen on (SPLATCT_PORT, default 8080)")
     parser.add_argument("--tie-to", type=int, metavar="PID", help=argparse.SUPPRESS)  # for `splatct up`
 
@@ -25,16 +27,18 @@ def run(args: argparse.Namespace) -> int:
 
     from server import logs
     from server.app import create_app
+    from server.opening import make_ready
     from server.settings import Settings
+    from server.wire import BoundedHead
     from worker.lifeline import die_with_parent
 
     if args.tie_to is not None:
         die_with_parent(args.tie_to, signal.SIGTERM)
     given = {name: getattr(args, name) for name in ("data", "host", "port")}
     settings = Settings.read(given)
-    settings.require_loopback()
     os.umask(0o077)
     logs.configure(settings.log_format)
+    make_ready(settings)
     logging.getLogger("splatct.server").info("http://%s:%d, data in %s", settings.host, settings.port, settings.data)
     app = create_app(settings)
 
@@ -49,11 +53,13 @@ def run(args: argparse.Namespace) -> int:
 
     config = uvicorn.Config(
         app,
+        http=BoundedHead,
         host=settings.host,
         port=settings.port,
         log_config=None,
         access_log=False,
         server_header=False,
+        forwarded_allow_ips=settings.trusted_proxies,
         timeout_graceful_shutdown=5,
     )
     server = Server(config)

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
+
+from splatcore.errors import OptionsError
+from splatcore.options import Options
 
 HELP = "check a scan folder: problems, facts, memory and time"
 
@@ -14,13 +18,22 @@ HELP = "check a scan folder: problems, facts, memory and time"
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scan", type=Path, help="folder with scan.json and TIFF files")
     parser.add_argument("--headers-only", action="store_true", help="look at scan.json and TIFF headers, not at pixels")
+    parser.add_argument(
+        "--options",
+        metavar="NAME=VALUE",
+        nargs="+",
+        help="estimate the cost with these options of reconstruct",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
     from splatcore.check import answer
 
+    options = None if args.options is None else _options(args.options)  # a wrong one is told before a long look
     status, text = answer(args.scan, pixels=not args.headers_only)
+    if status == 0 and options is not None:
+        text = json.dumps({**json.loads(text), "estimate": _estimate(json.loads(text)["facts"], options)})
     if args.json:
         print(text)
         return status
@@ -34,7 +47,35 @@ def run(args: argparse.Namespace) -> int:
                 print(f"      {problem['hint']}", file=sys.stderr)
         return status
     print("\n".join(_lines(found["facts"])))
+    if "estimate" in found:
+        cost = found["estimate"]
+        memory, disk = cost["memory_bytes"] / 1e9, cost["disk_bytes"] / 1e9
+        text = f"{memory:.1f} GB of memory, {cost['seconds']:.0f} s on two cores, {disk:.2f} GB of disk (rough)"
+        print(f"{'with options':<15} {text}")
+        print("".join(f"{'warning':<15} {text}\n" for text in cost["warnings"]), end="")
     return 0
+
+
+def _options(pairs: list[str]) -> Options:
+    given = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not (name and equals):
+            raise OptionsError(f"options: got {pair!r}, expected NAME=VALUE, as in quality=preview")
+        try:
+            given[name] = json.loads(text)
+        except ValueError:
+            given[name] = text
+    return Options.from_dict(given)
+
+
+def _estimate(facts: dict[str, Any], options: Options) -> dict[str, Any]:
+    from splatcore.estimate import estimate, warnings
+    from splatcore.machine import memory_bytes
+
+    found = estimate(facts["views"], facts["rows"], facts["cols"], facts["volume_shape"], options)
+    free = shutil.disk_usage(Path.cwd()).free
+    return {**found.to_json(), "warnings": warnings(found, memory_free=memory_bytes()[0], disk_free=free)}
 
 
 def _lines(facts: dict[str, Any]) -> list[str]:

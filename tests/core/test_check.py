@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 
 from splatcore import machine
+from splatcore.errors import OptionsError
+from splatcore.estimate import estimate, warnings
+from splatcore.options import Options
 from splatcore.verbs import check, doctor
 
 from .scanfolder import plain_images, write_scan
@@ -121,3 +124,29 @@ def test_limits_of_a_container_count(tmp_path: Path) -> None:
     (tmp_path / "memory.max").write_text("max\n")
     assert machine.threads_allowed(tmp_path) >= 1
     assert machine.memory_bytes(tmp_path)[1] > 1_000_000
+
+
+def test_options_change_the_estimate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = str(write_scan(tmp_path / "scan"))
+    costs = []
+    for options in (["quality=preview"], ["quality=fine", "splats=4000000"]):
+        assert run(check, scan, "--options", *options, "--json") == 0
+        costs.append(json.loads(capsys.readouterr().out)["estimate"])
+    assert costs[0]["memory_bytes"] < costs[1]["memory_bytes"] and costs[0]["seconds"] < costs[1]["seconds"]
+    assert costs[0]["disk_bytes"] < costs[1]["disk_bytes"]
+    assert run(check, scan, "--options", "quality=preview") == 0
+    assert "with options" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("pair", "says"), [("quality=best", "best"), ("speed=9", "unknown option"), ("x", "NAME=")])
+def test_an_option_that_cannot_be_used_is_told_at_once(tmp_path: Path, pair: str, says: str) -> None:
+    with pytest.raises(OptionsError, match=says):
+        run(check, str(tmp_path / "no scan here"), "--options", pair)
+
+
+def test_what_does_not_fit_is_said() -> None:
+    found = estimate(75, 256, 256, (128, 128, 128), Options())
+    assert warnings(found, memory_free=0, disk_free=0) == []
+    assert warnings(found, memory_free=2**40, disk_free=2**40, longest_s=1e6) == []
+    said = warnings(found, memory_free=100_000_000, disk_free=1_000_000, longest_s=10.0)
+    assert len(said) == 3 and "memory" in said[0] and "disk" in said[1] and "partial result" in said[2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -87,3 +88,28 @@ def test_wrong_volume_is_named(work, tmp_path):
     (tmp_path / "junk.npz").write_bytes(b"nothing")
     done = splatct("simulate", "--volume", tmp_path / "junk.npz", "--out", tmp_path / "scan", code=2)
     assert "junk.npz" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_ctrl_c_and_the_same_command_goes_on(work, tmp_path):
+    command = [sys.executable, "-m", "splatct_client", "reconstruct", str(work / "scan"), "-o", str(tmp_path / "out"),
+               "--threads", "1", "--quality", "preview"]  # fmt: skip
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as running:
+        assert running.stderr is not None
+        for line in running.stderr:
+            if "binning 2, step" in line:
+                running.send_signal(signal.SIGINT)
+                break
+        said = running.stderr.read()
+    assert running.returncode == 130 and "go on" in said and "Traceback" not in said
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["run.checkpoint"]
+    done = splatct(*command[3:])
+    assert "Going on from the checkpoint" in done.stderr and "binning 4" not in done.stderr
+    for name in ("volume.tif", "splats.npz"):
+        assert (tmp_path / "out" / name).read_bytes() == (work / "out" / name).read_bytes(), name
+    assert not (tmp_path / "out" / "run.checkpoint").exists()
+
+
+def test_what_is_not_of_an_interrupted_run_is_not_overwritten(work, tmp_path):
+    (tmp_path / "run.checkpoint").write_bytes(b"")
+    (tmp_path / "thesis.tex").write_text("years of work")
+    assert "not empty" in splatct("reconstruct", work / "scan", "-o", tmp_path, code=2).stderr

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import tifffile
 
+from server.migrations import prepare
 from server.settings import Settings
 from worker.contract import State
 from worker.database import Database
@@ -34,7 +35,7 @@ class Stage:
     def __post_init__(self) -> None:
         (self.data / "jobs").mkdir(parents=True, exist_ok=True)
         self.database = Database(Settings(data=self.data).database)
-        self.database.create_tables()
+        prepare(self.database)
         self.ledger = Ledger(self.database)
 
     def job(self, name: str, state: State = State.QUEUED, **values: Any) -> str:
@@ -66,6 +67,15 @@ class Stage:
         write_results(made, report or REPORT)
         folder.publish(1)
         assert self.ledger.succeed(job_id, 1)
+
+    def end_early(self, job_id: str) -> None:
+        """Cancelled, with what it had."""
+        assert self.ledger.ask_cancel(job_id)
+        folder = JobFolder(self.data, job_id)
+        folder.attempt(1).mkdir()
+        write_results(folder.attempt(1), REPORT)
+        assert folder.publish_partial(1)
+        assert self.ledger.end_cancel(job_id, 1, partial=True)
 
 
 REPORT = {

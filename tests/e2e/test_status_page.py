@@ -160,6 +160,20 @@ def test_a_hostile_report_stays_text(page: Page, stage: Stage) -> None:
     assert page.title() == "succeeded · teapot · SplatCT"
 
 
+def test_what_a_cancelled_job_had_is_shown(page: Page, stage: Stage) -> None:
+    job_id = stage.job("cut short")
+    stage.start(job_id)
+    stage.end_early(job_id)
+    page.goto(f"/jobs/{job_id}")
+    expect(page.locator("#state")).to_have_text("cancelled")
+    expect(page.locator("#files-heading")).to_have_text("Files of the partial result")
+    expect(page.locator("#fetch-command")).to_have_text(f"splatct fetch {job_id} --partial -o RESULTS")
+    expect(page.locator("#verdict-text")).to_contain_text("The scan is usable")
+    expect(page.locator("#views img").first).to_be_visible()
+    link = page.get_by_role("link", name="poses.json")
+    assert page.request.get(str(link.get_attribute("href"))).ok
+
+
 def test_a_job_is_cancelled_from_the_page(page: Page, stage: Stage) -> None:
     job = stage.job("teapot")
     page.goto(f"/jobs/{job}")

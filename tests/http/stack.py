@@ -19,7 +19,9 @@ import httpx
 import numpy as np
 import tifffile
 
+from server.keys import Key, KeyRing, Scope
 from server.redisserver import OwnRedis, embedded_program
+from worker.database import Database
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHONPATH = os.pathsep.join([str(ROOT), str(ROOT / "client"), str(ROOT / "tests" / "worker" / "fakes")])
@@ -103,10 +105,29 @@ class Stack:
             "SPLATCT_ENGINE": "fake_engine",
             "SPLATCT_RECONCILE_S": "0.5",
             "SPLATCT_CANCEL_GRACE_S": "1",
+            "SPLATCT_CHECKPOINT_S": "0.2",
         }
         self._log = (folder / "log.txt").open("ab")
         self._processes: list[subprocess.Popen[bytes]] = []
         self.http = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", trust_env=False, timeout=30)
+
+    def new_key(self, tenant: str, *scopes: str, expires_at: float | None = None) -> tuple[Key, str]:
+        """As `splatct keys add` makes one, while the server runs."""
+        database = Database(f"sqlite:///{self.data / 'splatct.db'}")
+        try:
+            return KeyRing(database).add(tenant, "for a test", map(Scope, scopes), expires_at)
+        finally:
+            database.close()
+
+    def revoke(self, key_id: str) -> None:
+        database = Database(f"sqlite:///{self.data / 'splatct.db'}")
+        assert KeyRing(database).revoke(key_id) is not None
+        database.close()
+
+    def client(self, key: str | None = None) -> httpx.Client:
+        """Closed by whoever asked for it."""
+        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        return httpx.Client(base_url=str(self.http.base_url), headers=headers, trust_env=False, timeout=30)
 
     def __enter__(self) -> Self:
         self.redis.start()

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import signal
+import subprocess
+import sys
 import time
+import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from redis import Redis
+
+from splatcore.simulate import Simulation, simulate
 
 from .stack import Stack, commit, kill, scan_files, submit
 
@@ -54,6 +62,105 @@ def test_a_killed_engine_is_started_again(stack: Stack) -> None:
     done = stack.wait(job_id, "succeeded", "failed")
     assert (done["state"], done["attempt"]) == ("succeeded", 2)
     assert publications(stack, job_id) == 1
+
+
+def steps(stack: Stack, job_id: str, attempt: int) -> list[int]:
+    events = stack.http.get(f"/v1/jobs/{job_id}/events").json()["events"]
+    return [e["step"] for e in events if e.get("attempt") == attempt and e["stage"] == "level"]
+
+
+def step_kept(stack: Stack, job_id: str) -> int:
+    """What the checkpoint says, once its writer is gone."""
+    stack.until(lambda: not stack.engine_pids(), 5, "the engine died with its worker")
+    with zipfile.ZipFile(stack.data / "jobs" / job_id / "run.checkpoint") as file:
+        return int(json.loads(file.read("state.json"))["dict"]["step"])
+
+
+def test_no_more_than_one_checkpoint_of_work_is_lost(stack: Stack) -> None:
+    """Worker killed, then everything but the data folder killed: the next attempt begins where the last state was
+    kept, and nothing before that is done twice."""
+    worker = stack.start_worker()
+    job_id = long_job(stack, steps=120)
+    stack.until(lambda: len(steps(stack, job_id, 1)) > 30, what="thirty steps")
+    kill(worker)
+    kept = [step_kept(stack, job_id)]
+    worker = stack.start_worker()
+    stack.until(lambda: len(steps(stack, job_id, 2)) > 30, what="thirty more steps")
+    kill(worker)
+    kept.append(step_kept(stack, job_id))
+    kill(stack.server)
+    stack.redis.kill()
+    stack.redis.start()
+    stack.start_server()
+    stack.start_worker()
+    done = stack.wait(job_id, "succeeded", "failed")
+    assert (done["state"], done["attempt"]) == ("succeeded", 3)
+    ran = [steps(stack, job_id, attempt) for attempt in (1, 2, 3)]
+    assert all(part == list(range(part[0], part[-1] + 1)) for part in ran)
+    assert [ran[1][0], ran[2][0]] == kept and kept[0] > 0
+    assert ran[2][-1] == 119
+    events = stack.http.get(f"/v1/jobs/{job_id}/events").json()["events"]
+    assert sum("Going on from the checkpoint" in event["message"] for event in events) == 2
+
+
+@pytest.mark.slow
+def test_the_real_engine_killed_twice_gives_the_bits_of_one_that_was_not(stack: Stack) -> None:
+    z, y, x = np.mgrid[-1:1:24j, -1:1:24j, -1:1:24j]
+    body = 0.5 * (x**2 + (y / 0.7) ** 2 + z**2 < 0.6) + 0.4 * (abs(x + 0.3) + abs(y) + abs(z) < 0.25)
+    folder = stack.data.parent / "real"
+    simulate(body.astype(np.float32), folder, Simulation(views=16, det=48, sigma_rot=0.02, seed=1), 1, name="real")
+    scan_id = commit(
+        stack.http, {file.name: file.read_bytes() for file in folder.iterdir() if file.name != "truth.tif"}
+    )
+    stack.environment |= {"SPLATCT_ENGINE": "splatcore", "SPLATCT_TEST_MODE": "1", "SPLATCT_TEST_STEP_S": "0.002"}
+    worker = stack.start_worker()
+    options = {"quality": "preview", "splats": 1500, "threads": 1}
+    plain = stack.wait(submit(stack.http, scan_id, **options), "succeeded", "failed", seconds=120)
+    job_id = submit(stack.http, scan_id, **options)
+    for attempt, share in ((1, 0.3), (2, 0.6)):
+        stack.until(lambda share=share: stack.job(job_id)["progress"] > share, 60, f"{share} of attempt {attempt}")  # type: ignore[misc]
+        if attempt == 1:
+            os.kill(stack.engine_pids()[0], signal.SIGKILL)
+        else:
+            kill(worker)
+            stack.start_worker()
+        stack.until(lambda attempt=attempt: stack.job(job_id)["attempt"] > attempt, 20, "another attempt")  # type: ignore[misc]
+    done = stack.wait(job_id, "succeeded", "failed", seconds=120)
+    assert (plain["state"], done["state"], done["attempt"]) == ("succeeded", "succeeded", 3)
+    for name in ("volume.tif", "splats.npz", "report.json"):
+        got = [stack.http.get(f"/v1/jobs/{job['id']}/results/{name}").content for job in (plain, done)]
+        assert got[0] == got[1], name
+
+
+def test_a_drained_worker_loses_no_work(stack: Stack) -> None:
+    worker = stack.start_worker()
+    job_id = long_job(stack, steps=100)
+    stack.until(lambda: len(steps(stack, job_id, 1)) > 30, what="thirty steps")
+    worker.terminate()
+    assert worker.wait(20) == 0
+    stack.start_worker()
+    assert stack.wait(job_id, "succeeded", "failed")["state"] == "succeeded"
+    assert steps(stack, job_id, 2)[0] in (steps(stack, job_id, 1)[-1], steps(stack, job_id, 1)[-1] + 1)
+
+
+def test_what_a_cancelled_job_had_can_be_fetched(stack: Stack) -> None:
+    stack.start_worker()
+    job_id = long_job(stack, steps=400)
+    mid_job(stack, job_id)
+    stack.http.post(f"/v1/jobs/{job_id}/cancel")
+    job = stack.wait(job_id, "cancelled")
+    assert "partial" in job["message"] and stack.http.get(f"/v1/jobs/{job_id}/results").status_code == 409
+    manifest = stack.http.get(job["links"]["partial"]).json()
+    for file in manifest["files"]:
+        got = stack.http.get(f"/v1/jobs/{job_id}/partial/{file['name']}").raise_for_status().content
+        assert hashlib.sha256(got).hexdigest() == file["sha256"]
+    command = [sys.executable, "-m", "splatct_client", "fetch", job_id, "--server", str(stack.http.base_url)]
+    for more, code in ([], 1), (["--partial"], 0):
+        out = ["-o", str(stack.data.parent / "fetched")]
+        assert subprocess.run([*command, *more, *out], capture_output=True, check=False).returncode == code
+    assert (stack.data.parent / "fetched" / "manifest.json").exists()
+    assert stack.http.get(f"/v1/jobs/{job_id}/slices/z/2.png").headers["content-type"] == "image/png"
+    assert stack.http.get(job["links"]["report"]).status_code == 200
 
 
 def test_a_stopped_worker_hands_its_job_back(stack: Stack) -> None:

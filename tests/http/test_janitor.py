@@ -11,6 +11,7 @@ import pytest
 
 from server import janitor
 from server.intake import Intake
+from server.migrations import prepare
 from server.partial import Partial
 from server.store import File, Store
 from worker.database import Database
@@ -21,7 +22,7 @@ HOUR = 3600.0
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
     database = Database(f"sqlite:///{tmp_path / 'test.db'}")
-    database.create_tables()
+    prepare(database)
     (tmp_path / "jobs").mkdir()
     yield Store(database)
     database.close()

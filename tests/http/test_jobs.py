@@ -78,6 +78,12 @@ UNKNOWN = [
     ("GET", "/v1/jobs/{}/results/volume.tif"),
     ("GET", "/v1/jobs/{}/slices/x/0.png"),
     ("GET", "/v1/jobs/{}/report"),
+    ("POST", "/v1/jobs/{}/restart"),
+    ("GET", "/v1/jobs/{}/partial"),
+    ("GET", "/v1/jobs/{}/partial/volume.tif"),
+    ("GET", "/v1/webhooks/{}"),
+    ("DELETE", "/v1/webhooks/{}"),
+    ("GET", "/v1/webhooks/{}/deliveries"),
 ]
 
 

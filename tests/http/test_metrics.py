@@ -12,6 +12,7 @@ import sqlalchemy as sa
 from prometheus_client.parser import text_string_to_metric_families
 
 from server.census import OVERLAP_S, Outcomes
+from server.migrations import prepare
 from worker.contract import State
 from worker.database import Database
 from worker.ledger import Ledger, jobs
@@ -109,7 +110,7 @@ def test_requests_are_counted_by_route_and_no_id_is_a_label(shared: Stack) -> No
 @pytest.fixture
 def database(tmp_path: Path) -> Iterator[Database]:
     opened = Database(f"sqlite:///{tmp_path / 'test.db'}")
-    opened.create_tables()
+    prepare(opened)
     yield opened
     opened.close()
 

@@ -8,9 +8,10 @@ from uuid import uuid4
 
 import pytest
 
+from server.migrations import prepare
 from server.reconcile import Reconciler
 from server.store import Store
-from worker.contract import DEAD_S, STUCK_S, ErrorKind, State
+from worker.contract import DEAD_S, MAX_CRASHES, STUCK_S, ErrorKind, State
 from worker.database import Database
 from worker.jobfolder import JobFolder
 from worker.ledger import Job
@@ -57,7 +58,7 @@ class World:
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
     database = Database(f"sqlite:///{tmp_path / 'test.db'}")
-    database.create_tables()
+    prepare(database)
     yield World(tmp_path, database)
     database.close()
 
@@ -111,14 +112,14 @@ def test_a_cancelled_jobs_results_are_dropped(world: World) -> None:
     assert not JobFolder(world.data, job.id).results.exists()
 
 
-def test_three_deaths_are_enough(world: World) -> None:
+def test_it_is_given_up_at_last(world: World) -> None:
     job = world.running(host_id())
-    for attempt in (1, 2, 3):
+    for attempt in range(1, MAX_CRASHES + 1):
         world.reconciler.sweep()
         world.store.jobs.claim(job.id, attempt + 1, host_id())
     end = world.store.jobs.get(job.id)
     assert end is not None and (end.state, end.error_kind) == (State.FAILED, ErrorKind.CRASHED)
-    assert "The worker died, 3 times" in (end.error_message or "")
+    assert f"The worker died, {MAX_CRASHES} times" in (end.error_message or "")
 
 
 def test_a_job_without_a_folder_fails_with_a_reason(world: World) -> None:

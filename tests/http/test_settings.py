@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from server.opening import make_ready
 from server.settings import Settings, SettingsError
 
 
@@ -31,21 +32,47 @@ def test_what_the_command_line_gives_comes_first_and_every_fault_is_named(monkey
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "example.org", ""])
-def test_only_loopback_is_served(host: str) -> None:
-    with pytest.raises(SettingsError, match="no authentication"):
-        Settings(host=host).require_loopback()
+def test_without_keys_only_loopback_is_served(host: str) -> None:
+    with pytest.raises(SettingsError, match=rf"host: got '{host}'.*there are no keys.*splatct keys add"):
+        Settings(host=host, allowed_hosts="ct.example.org").require_door(keys_exist=False)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", ""])
+def test_beyond_loopback_a_server_needs_a_name(host: str) -> None:
+    with pytest.raises(SettingsError, match=r"allowed_hosts .*is empty"):
+        Settings(host=host).require_door(keys_exist=True)
+    named = Settings(host=host, allowed_hosts=" CT.example.org,, [fd00::5] ")
+    named.require_door(keys_exist=True)
+    assert named.host_names == {"ct.example.org", "fd00::5"}
+
+
+def test_a_server_that_goes_by_a_name_needs_keys_even_on_loopback() -> None:
+    """Else a proxy before it, or a page that rebinds the name, would let everybody in."""
+    settings = Settings(allowed_hosts="ct.example.org")
+    assert not settings.may_be_open and Settings().may_be_open
+    settings.require_door(keys_exist=True)
+    with pytest.raises(SettingsError, match=r"allowed_hosts .*got 'ct.example.org'.*there are no keys"):
+        settings.require_door(keys_exist=False)
+
+
+def test_a_network_that_is_none_is_refused_before_anything_listens() -> None:
+    assert len(Settings(webhook_allow=" 10.1.0.0/16, fd00::/8,").webhook_networks) == 2
+    with pytest.raises(SettingsError, match=r"SPLATCT_WEBHOOK_ALLOW\): got '10.1.0.1/16'"):
+        make_ready(Settings(webhook_allow="10.1.0.1/16"))
+
+
+def test_an_address_that_is_listened_on_is_a_name() -> None:
+    settings = Settings(host="192.168.1.5")
+    settings.require_door(keys_exist=True)
+    assert settings.host_names == {"192.168.1.5"}
 
 
 @pytest.mark.parametrize(("host", "served"), [("0.0.0.0", True), ("::", True), ("192.168.1.5", False), ("", False)])
 def test_a_container_published_on_loopback_may_listen_on_all_its_addresses(host: str, served: bool) -> None:
     settings = Settings(host=host, published_on_loopback=True)
-    if served:
-        settings.require_loopback()
-    else:
-        with pytest.raises(SettingsError, match="no authentication"):
-            settings.require_loopback()
+    assert settings.only_loopback_reaches_us is served
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost", "127.1.2.3"])
-def test_loopback_names(host: str) -> None:
-    Settings(host=host).require_loopback()
+def test_loopback_needs_no_keys(host: str) -> None:
+    Settings(host=host).require_door(keys_exist=False)

@@ -14,6 +14,7 @@ import httpx
 import pytest
 import sqlalchemy as sa
 
+from server.migrations import prepare
 from server.store import File, NewJob, Store
 from server.submissions import KEPT_S, Claim, Kind, submissions
 from worker.database import Database
@@ -154,7 +155,7 @@ def test_what_a_cut_off_submission_left_is_replaced(http: httpx.Client, idle: St
 
 def test_keys_are_forgotten_after_a_day_and_ids_with_their_jobs(tmp_path: Path) -> None:
     database = Database(f"sqlite:///{tmp_path / 'test.db'}")
-    database.create_tables()
+    prepare(database)
     store = Store(database)
     upload = store.add_upload("scan", [File("scan.json", 1, None, None)])
     scan = store.commit(upload, {})

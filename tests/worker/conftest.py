@@ -9,6 +9,7 @@ from uuid import uuid4
 
 import pytest
 
+from server.migrations import prepare
 from worker.database import Database
 from worker.jobfolder import JobFolder
 from worker.ledger import Job, Ledger
@@ -20,7 +21,7 @@ FAKES = Path(__file__).parent / "fakes"
 @pytest.fixture
 def database(tmp_path: Path) -> Iterator[Database]:
     opened = Database(f"sqlite:///{tmp_path / 'test.db'}")
-    opened.create_tables()
+    prepare(opened)
     yield opened
     opened.close()
 
@@ -33,7 +34,7 @@ def ledger(database: Database) -> Ledger:
 @pytest.fixture
 def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> WorkerSettings:
     monkeypatch.setenv("PYTHONPATH", str(FAKES))
-    return WorkerSettings(data=tmp_path, engine="fake_engine", cancel_grace_s=0.3)
+    return WorkerSettings(data=tmp_path, engine="fake_engine", cancel_grace_s=1.0, checkpoint_s=0.2)
 
 
 @pytest.fixture

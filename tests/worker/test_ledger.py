@@ -58,7 +58,7 @@ def test_crashes_are_counted_and_end(ledger: Ledger, new_job: NewJob) -> None:
         assert claimed is not None and ledger.crashed(claimed, "The engine was killed (SIGKILL)")
     end = current(ledger, job)
     assert (end.state, end.error_kind, end.attempt) == (State.FAILED, ErrorKind.CRASHED, MAX_CRASHES)
-    assert end.error_message is not None and "killed (SIGKILL), 3 times" in end.error_message
+    assert end.error_message is not None and f"killed (SIGKILL), {MAX_CRASHES} times" in end.error_message
     assert end.finished_at is not None
 
 
@@ -123,7 +123,7 @@ def test_pages_and_positions(ledger: Ledger, new_job: NewJob) -> None:
 def test_many_and_the_queue(ledger: Ledger, new_job: NewJob) -> None:
     jobs = [new_job() for _ in range(4)]
     ledger.claim(jobs[1].id, 1, "here")
-    assert ledger.queue() == [jobs[0].id, jobs[2].id, jobs[3].id]
+    assert ledger.positions() == {jobs[0].id: 1, jobs[2].id: 2, jobs[3].id: 3}
     assert [ledger.position(jobs[n]) for n in (0, 2, 3)] == [1, 2, 3], "the same order"
     found = {job.id: job.state for job in ledger.many([jobs[0].id, jobs[1].id, "none"])}
     assert found == {jobs[0].id: State.QUEUED, jobs[1].id: State.RUNNING}

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import socket
-import subprocess
-import tempfile
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 from sqlalchemy.exc import IntegrityError
 
+from server.migrations import prepare
+from server.problems import ApiProblem
+from server.quotas import Quotas
 from server.store import File, NewJob, Store
 from server.submissions import Claim, Kind
 from worker.contract import State
 from worker.database import Database
 from worker.ledger import Ledger
 
+from ..postgres import emptied, running_postgres
 from .test_ledger import (  # noqa: F401  collected here once more, on the database below
     test_a_scan_is_needed_until_its_job_ends,
     test_a_stale_attempt_is_fenced_off,
@@ -33,48 +31,18 @@ from .test_ledger import (  # noqa: F401  collected here once more, on the datab
 )
 
 pytestmark = pytest.mark.system
-USER = "nobody" if os.geteuid() == 0 else None  # PostgreSQL refuses to run as root
-
-
-def program(name: str) -> str:
-    """A PostgreSQL program; Debian keeps them off the PATH."""
-    versions = sorted(Path("/usr/lib/postgresql").glob(f"*/bin/{name}"))
-    found = shutil.which(name) or (str(versions[-1]) if versions else None)
-    if found is None:
-        pytest.skip(f"no {name} on this system")
-    return found
 
 
 @pytest.fixture(scope="module")
 def url() -> Iterator[str]:
-    """A PostgreSQL server of one's own, on a free loopback port."""
-    initdb, pg_ctl = program("initdb"), program("pg_ctl")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    folder = Path(tempfile.mkdtemp(prefix="splatct-pg-"))
-    if USER:
-        shutil.chown(folder, USER)
-
-    def run(*command: str) -> None:
-        subprocess.run(command, user=USER, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd="/")
-
-    data = str(folder / "data")
-    run(initdb, "-D", data, "-U", "splatct", "-A", "trust", "-E", "UTF8", "--locale", "C", "-N")
-    options = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories={folder}"
-    run(pg_ctl, "-D", data, "-w", "-o", options, "-l", str(folder / "log"), "start")
-    yield f"postgresql+psycopg://splatct@127.0.0.1:{port}/postgres"
-    run(pg_ctl, "-D", data, "-w", "-m", "immediate", "stop")
-    shutil.rmtree(folder)
+    with running_postgres() as address:
+        yield address
 
 
 @pytest.fixture
 def database(url: str) -> Iterator[Database]:
-    from worker.database import metadata
-
-    opened = Database(url)
-    metadata.drop_all(opened.engine)
-    opened.create_tables()
+    opened = Database(emptied(url))
+    prepare(opened)
     yield opened
     opened.close()
 
@@ -108,3 +76,36 @@ def test_of_submissions_at_once_one_makes_the_job(database: Database, kind: Kind
             assert sum(pool.map(submit, range(6))) == 1
         assert len(placed) == 1 and len(store.jobs.in_states(State)) == turn + 1
     store.submissions.purge()
+
+
+def test_of_uploads_at_once_no_more_than_fit_the_quota_are_taken(database: Database) -> None:
+    quotas, together = Quotas(35, 2), threading.Barrier(6)
+    stores = {tenant: Store(database, tenant) for tenant in ("a", "b")}
+
+    def announce(number: int) -> bool:
+        tenant = "ab"[number % 2]
+        together.wait()
+        try:
+            stores[tenant].add_upload("scan", [File("scan.json", 10, None, None)], quotas.room_for(tenant, 10))
+        except ApiProblem:
+            return False
+        return True
+
+    with ThreadPoolExecutor(6) as pool:
+        taken = [number % 2 for _ in range(4) for number, done in enumerate(pool.map(announce, range(6))) if done]
+    assert (taken.count(0), taken.count(1)) == (3, 3)
+
+
+def test_of_jobs_at_once_no_more_than_the_quota_are_queued(database: Database) -> None:
+    quotas, together, store = Quotas(0, 2), threading.Barrier(6), Store(database, "a")
+    scan = store.commit(store.add_upload("scan", [File("scan.json", 1, None, None)]), {})
+
+    def submit(number: int) -> bool:
+        together.wait()
+        try:
+            return store.add_job(NewJob(str(number), "job", {}), scan, lambda: None, quotas.place_for("a"))
+        except ApiProblem:
+            return False
+
+    with ThreadPoolExecutor(6) as pool:
+        assert sum(pool.map(submit, range(6))) == 2

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import signal
 import threading
 import time
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from worker.contract import ErrorKind, State
+from worker.contract import MAX_CRASHES, ErrorKind, State
 from worker.jobfolder import JobFolder
 from worker.journal import read_events
 from worker.ledger import Job, Ledger
@@ -64,7 +68,7 @@ def test_success(run: Run, new_job: NewJob, tmp_path: Path) -> None:
     job = run(new_job(steps=4))
     folder = JobFolder(tmp_path, job.id)
     assert (job.state, job.progress, job.error_kind) == (State.SUCCEEDED, 1.0, None)
-    assert folder.published()
+    assert folder.published() and not folder.checkpoint.exists()
     assert not folder.scan.exists() and not list(folder.path.glob("attempt-*"))
     events = read_events(folder.events, 0, 100)
     assert [e["stage"] for e in events] == ["read", "level", "level", "level", "level"]
@@ -89,14 +93,73 @@ def test_errors_have_kinds_and_words(run: Run, new_job: NewJob, end: str, kind: 
     assert "secret detail" not in (job.error_message or "")
 
 
-def test_a_killed_engine_is_tried_again_but_not_for_ever(run: Run, new_job: NewJob) -> None:
-    job = run(new_job(end="killed"))
-    assert (job.state, job.attempt) == (State.QUEUED, 2)
-    job = run(job)
-    assert (job.state, job.attempt) == (State.QUEUED, 3)
+def test_a_killed_engine_is_tried_again_but_not_for_ever(run: Run, new_job: NewJob, tmp_path: Path) -> None:
+    job = new_job(end="killed", steps=0)
+    for attempt in range(2, MAX_CRASHES + 1):
+        job = run(job)
+        assert (job.state, job.attempt) == (State.QUEUED, attempt)
     job = run(job)
     assert (job.state, job.error_kind) == (State.FAILED, ErrorKind.CRASHED)
-    assert "SIGKILL" in (job.error_message or "")
+    message = job.error_message or ""
+    assert "SIGKILL" in message and "environment: " in message  # the end of its log
+
+
+def test_an_engine_that_gets_further_each_time_is_not_given_up(
+    settings: WorkerSettings, ledger: Ledger, new_job: NewJob
+) -> None:
+    """A machine that kills it every few steps costs attempts, not the job."""
+    job = new_job(steps=60, pause=0.05)
+    for _ in range(20):
+        before = ledger.get(job.id)
+        assert before is not None
+        if before.state is State.SUCCEEDED:
+            break
+        killer = when_running(ledger, job, lambda: later(0.7, lambda: kill_engine(job.id)))
+        supervise(settings, ledger, job.id, before.attempt)
+        killer.join()
+    done = ledger.get(job.id)
+    assert done is not None and done.state is State.SUCCEEDED and done.attempt > 2 and done.crashes == 1
+
+
+def kill_engine(job_id: str) -> None:
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            if entry.name.isdecimal() and f"jobs/{job_id}".encode() in (entry / "cmdline").read_bytes():
+                os.kill(int(entry.name), signal.SIGKILL)
+
+
+def test_the_next_attempt_goes_on_from_the_last_checkpoint(run: Run, new_job: NewJob, tmp_path: Path) -> None:
+    job = run(new_job(steps=20, pause=0.05, dies_at=12))
+    assert (job.state, job.attempt, job.crashes) == (State.QUEUED, 2, 1) and "SIGSEGV" in job.message
+    with zipfile.ZipFile(JobFolder(tmp_path, job.id).checkpoint) as kept:
+        step_kept = json.loads(kept.read("state.json"))["dict"]["step"]
+    done = run(job)
+    assert done.state is State.SUCCEEDED and done.attempt == 2
+    events = read_events(JobFolder(tmp_path, job.id).events, 0, 100)
+    first = [e["step"] for e in events if e["stage"] == "level" and e["attempt"] == 1]
+    second = [e["step"] for e in events if e["stage"] == "level" and e["attempt"] == 2]
+    assert first == list(range(13)) and second == list(range(second[0], 20))
+    assert 1 <= second[0] <= 13 and second[0] == step_kept
+    assert any("Going on from the checkpoint" in e["message"] for e in events)
+
+
+def test_the_kernel_s_word_tells_want_of_memory_from_a_crash(
+    run: Run, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("worker.supervise.OomWatch.killed", lambda _self: True)
+    job = run(new_job(end="killed"))
+    assert (job.state, job.error_kind) == (State.FAILED, ErrorKind.OUT_OF_MEMORY)
+    assert "memory" in (job.error_message or "")
+
+
+def test_an_engine_that_takes_too_much_memory_is_told_so(
+    settings: WorkerSettings, ledger: Ledger, new_job: NewJob
+) -> None:
+    job = new_job(allocate_mib=6000)
+    supervise(settings.model_copy(update={"engine_memory_mib": 512}), ledger, job.id, 1)
+    ended = ledger.get(job.id)
+    assert ended is not None and (ended.state, ended.error_kind) == (State.FAILED, ErrorKind.OUT_OF_MEMORY)
+    assert ended.attempt == 1
 
 
 def test_the_engine_knows_no_secrets(
@@ -117,29 +180,53 @@ def test_cancel_between_events(run: Run, ledger: Ledger, new_job: NewJob, tmp_pa
     ended = run(job)
     thread.join()
     assert ended.state is State.CANCELLED and time.monotonic() - started < 15
-    assert not JobFolder(tmp_path, job.id).published()
+    folder = JobFolder(tmp_path, job.id)
+    assert not folder.published() and ended.partial and "partial" in ended.message
+    assert json.loads((folder.partial / "manifest.json").read_text())["partial"] is True
+    assert sorted(path.name for path in folder.path.iterdir()) == [
+        ".lock", "events.jsonl", "job.json", "log.txt", "partial", "run.checkpoint"
+    ]  # fmt: skip
 
 
 def test_cancel_an_engine_that_does_not_listen(run: Run, ledger: Ledger, new_job: NewJob) -> None:
     job = new_job(deaf=True)
     thread = when_running(ledger, job, lambda: ledger.ask_cancel(job.id))
-    assert run(job).state is State.CANCELLED
+    ended = run(job)
+    assert ended.state is State.CANCELLED and not ended.partial
     thread.join()
 
 
-def test_sigterm_hands_the_job_back(run: Run, ledger: Ledger, new_job: NewJob) -> None:
+def test_sigterm_hands_the_job_back(run: Run, ledger: Ledger, new_job: NewJob, tmp_path: Path) -> None:
     job = new_job(steps=2000, pause=0.05)
     thread = when_running(ledger, job, lambda: os.kill(os.getpid(), signal.SIGTERM))
     ended = run(job)
     thread.join()
     assert (ended.state, ended.attempt, ended.crashes) == (State.QUEUED, 2, 0)
+    assert JobFolder(tmp_path, job.id).checkpoint.exists()
 
 
-def test_time_limit(ledger: Ledger, new_job: NewJob, settings: WorkerSettings) -> None:
-    job = new_job(steps=2000, pause=0.05)
-    supervise(settings.model_copy(update={"job_seconds": 1.0}), ledger, job.id, 1)
+def test_an_engine_that_cannot_be_drained_is_killed_in_time(
+    settings: WorkerSettings, ledger: Ledger, new_job: NewJob
+) -> None:
+    job = new_job(native=True)
+    thread = when_running(ledger, job, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    started = time.monotonic()
+    supervise(settings.model_copy(update={"drain_grace_s": 0.5}), ledger, job.id, 1)
+    thread.join()
+    ended = ledger.get(job.id)
+    assert ended is not None and (ended.state, ended.crashes) == (State.QUEUED, 0)
+    assert time.monotonic() - started < 15
+
+
+@pytest.mark.parametrize("plan", [{"steps": 2000, "pause": 0.05}, {"native": True}])
+def test_time_limit(ledger: Ledger, new_job: NewJob, settings: WorkerSettings, plan: dict[str, Any]) -> None:
+    """Also deep inside native code, where no signal handler runs."""
+    job = new_job(**plan)
+    started = time.monotonic()
+    supervise(settings.model_copy(update={"job_seconds": 2.0}), ledger, job.id, 1)
     ended = ledger.get(job.id)
     assert ended is not None and (ended.state, ended.error_kind) == (State.FAILED, ErrorKind.TIMEOUT)
+    assert ended.partial == ("native" not in plan) and time.monotonic() - started < 15
 
 
 def test_a_job_that_was_taken_away_is_dropped(run: Run, ledger: Ledger, new_job: NewJob, tmp_path: Path) -> None:
@@ -154,7 +241,7 @@ def test_a_job_that_was_taken_away_is_dropped(run: Run, ledger: Ledger, new_job:
     thread = when_running(ledger, job, take_away)
     ended = run(job)
     thread.join()
-    assert claimed == [True]
+    assert claimed == [State.QUEUED]
     assert (ended.state, ended.attempt) == (State.QUEUED, 2)
     assert not JobFolder(tmp_path, job.id).published()
 
@@ -199,7 +286,7 @@ def test_published_but_not_recorded_is_recorded_without_running_again(
     assert folder.results.stat().st_ino == inode
 
 
-def test_cancelled_after_the_rename_leaves_no_results(
+def test_cancelled_after_the_rename_has_them_as_a_partial_result(
     run: Run, ledger: Ledger, new_job: NewJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     publish = JobFolder.publish
@@ -210,5 +297,6 @@ def test_cancelled_after_the_rename_leaves_no_results(
 
     monkeypatch.setattr(JobFolder, "publish", publish_then_cancel)
     job = run(new_job())
-    assert job.state is State.CANCELLED
-    assert not JobFolder(tmp_path, job.id).results.exists()
+    folder = JobFolder(tmp_path, job.id)
+    assert job.state is State.CANCELLED and job.partial
+    assert not folder.results.exists() and folder.published_partial()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from splatct_client.verbs import add_server_option, print_json
+from splatct_client.verbs import add_server_option, connect, print_json
 
 HELP = "stop queued or running jobs"
 
@@ -15,10 +15,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from splatct_client.client import Client
-
     jobs = []
-    with Client(args.server) as client:
+    with connect(args) as client:
         for job_id in args.job:
             jobs.append(client.cancel(job_id))
             if not args.json:

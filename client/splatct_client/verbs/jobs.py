@@ -7,7 +7,7 @@ import json
 from typing import TYPE_CHECKING
 
 from splatct_client.bar import seconds_text
-from splatct_client.verbs import add_server_option, print_json
+from splatct_client.verbs import add_server_option, connect, print_json
 
 if TYPE_CHECKING:
     from splatct_client.models import Job
@@ -25,9 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from splatct_client.client import Client
-
-    with Client(args.server) as client:
+    with connect(args) as client:
         if args.job:
             job = client.job(args.job)
             print_json({"job": job.to_json()}) if args.json else print(_card(job))

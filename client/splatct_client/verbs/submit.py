@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from splatct_client.bar import Bar, seconds_text, size_text
 from splatct_client.errors import ClientError, InputError, JobFailed, Problem, ServerProblem
 from splatct_client.scanfolder import ScanFolder, read_scan_folder
-from splatct_client.verbs import add_server_option, print_json
+from splatct_client.verbs import add_server_option, connect, print_json
 
 if TYPE_CHECKING:
     from splatct_client.client import Client
@@ -29,23 +29,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--option", metavar="NAME=VALUE", action="append", default=[], help="an option of the engine; may be repeated"
     )
+    parser.add_argument("--priority", choices=("low", "normal", "high"), help="among your own jobs; default normal")
     parser.add_argument("--wait", action="store_true", help="stay until the job has finished")
     parser.add_argument("-o", "--out", metavar="OUT", type=Path, help="wait, then fetch the results into this folder")
     parser.add_argument("--overwrite", action="store_true", help="let OUT have files in it")
 
 
 def run(args: argparse.Namespace) -> int:
-    from splatct_client.client import Client
     from splatct_client.outfolder import check_out_folder, fetch_results
 
     options = parse_options(args.option, args.calibrate)
     scan = read_scan_folder(args.scan)
     if args.out:
         check_out_folder(args.out, overwrite=args.overwrite)
-    with Client(args.server) as client:
+    with connect(args) as client:
         check_options(options, client.options())  # before a long upload, not after it
         scan_id = send(client, scan)
-        job = client.submit(scan_id, options, args.name)
+        job = client.submit(scan_id, options, args.name, args.priority)
         _tell(args, f"job {job.id} is {job.state}; its page: {client.base_url}/jobs/{job.id}")
         fetched: list[Path] = []
         if args.wait or args.out:

@@ -1,3 +1,4 @@
+import itertools
 import os
 import signal
 import sys
@@ -6,21 +7,36 @@ from collections.abc import Generator
 from typing import Any
 
 from splatcore.errors import ReconstructionError
+from splatcore.keeper import Concluding, Keeper
 from splatcore.options import Options
 from splatcore.progress import Progress
 
 
-def reconstruct(plan: dict[str, Any], options: Options) -> Generator[Progress, None, dict[str, Any]]:
+def reconstruct(plan: dict[str, Any], options: Options, keeper: Keeper) -> Generator[Progress, None, dict[str, Any]]:
     print("a stray print must not disturb the events")
     print(f"environment: {' '.join(sorted(os.environ))}", file=sys.stderr, flush=True)
-    yield Progress("read", 0.0, "Reading")
+    about = {"format": "splatct-checkpoint", "version": 1, "software": "fake", "scan": plan, "options": {}}
+    state, word = keeper.recall(lambda: about, ())
+    first = 0 if state is None else state["step"]
+    yield Progress("read", 0.0, word or "Reading")
     steps = plan.get("steps", 3)
     if plan.get("deaf"):
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         time.sleep(3600)
-    for step in range(steps):
-        time.sleep(plan.get("pause", 0.0))
-        yield Progress("level", (step + 1) / (steps + 1), f"Step {step + 1} of {steps}", step=step, loss=1 / (step + 1))
+    if plan.get("allocate_mib"):
+        bytearray(plan["allocate_mib"] << 20)
+    if plan.get("native"):
+        sum(itertools.repeat(1, 1 << 60))  # in C, and with the interpreter's lock
+    try:
+        for step in range(first, steps):
+            keeper.pause(lambda step=step: {"step": step})
+            time.sleep(plan.get("pause", 0.0))
+            fraction = (step + 1) / (steps + 1)
+            yield Progress("level", fraction, f"Step {step + 1} of {steps}", step=step, loss=1 / (step + 1))
+            if plan.get("dies_at") == step and not first:
+                os.kill(os.getpid(), signal.SIGSEGV)
+    except Concluding:
+        return {"options": options.to_dict(), "seed": options.seed, "partial": True}
     end = plan.get("end")
     if end == "memory":
         raise MemoryError

@@ -1,0 +1,39 @@
+"""uvicorn's HTTP protocol, with an end to how long a request's head may go on.
+
+httptools keeps a header until it is whole, and has no limit of its own: one that never ends would fill the
+memory before any middleware is asked. Heads that do end are judged by `server.guard`, which answers in full.
+"""
+
+from __future__ import annotations
+
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+from server.limits import HEAD_BYTES
+
+_REFUSAL = (
+    b"HTTP/1.1 431 Request Header Fields Too Large\r\n"
+    b"content-type: application/problem+json\r\ncontent-length: 0\r\nconnection: close\r\n\r\n"
+)
+
+
+class BoundedHead(HttpToolsProtocol):
+    """Closes a connection on which more than `HEAD_BYTES` came without a head being whole."""
+
+    _pending = 0
+    _in_body = False
+
+    def data_received(self, data: bytes) -> None:
+        if not self._in_body:
+            self._pending += len(data)
+        super().data_received(data)
+        if not self._in_body and self._pending > HEAD_BYTES and not self.transport.is_closing():
+            self.transport.write(_REFUSAL)
+            self.transport.close()
+
+    def on_headers_complete(self) -> None:
+        self._in_body, self._pending = True, 0
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        super().on_message_complete()
+        self._in_body, self._pending = False, 0

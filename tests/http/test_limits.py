@@ -1,0 +1,208 @@
+"""How much, how often and how large: quotas of a tenant, rates of a key, sizes of a request."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from uuid import uuid4
+
+import httpx
+import pytest
+
+from server.limits import HEAD_BYTES
+from server.rates import Buckets, neighbourhood
+
+from .stack import Stack, announce, commit, scan_files, send, submit
+
+FILES = scan_files()
+SIZE = sum(map(len, FILES.values()))
+BODY = {"name": "s", "files": [{"name": name, "size": len(data)} for name, data in FILES.items()]}
+
+
+@pytest.fixture(scope="module")
+def narrow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
+    """Room for three scans and two jobs a tenant, five requests at once and one a second a key. No worker."""
+    running = Stack(tmp_path_factory.mktemp("narrow"))
+    running.environment |= {
+        "SPLATCT_TENANT_GIB": str(3.5 * SIZE / (1 << 30)),
+        "SPLATCT_TENANT_JOBS": "2",
+        "SPLATCT_RATE_PER_S": "0",
+        "SPLATCT_FAILURES_PER_MIN": "6",
+    }
+    with running:
+        yield running
+
+
+@pytest.fixture
+def tenant(narrow: Stack) -> Iterator[httpx.Client]:
+    """A client of a tenant that has nothing yet."""
+    with narrow.client(narrow.new_key(f"t-{uuid4().hex[:8]}", "admin")[1]) as http:
+        yield http
+
+
+def test_bytes_are_taken_when_an_upload_is_announced_and_given_back(tenant: httpx.Client) -> None:
+    uploads = [announce(tenant, FILES)["id"] for _ in range(2)] + [send(tenant, FILES)]
+    scan_id = tenant.post(f"/v1/uploads/{uploads[2]}/commit").json()["id"]
+    full = tenant.post("/v1/uploads", json=BODY)
+    assert full.status_code == 507 and full.json()["type"] == "urn:splatct:problem:quota-exceeded"
+    limit = round(3.5 * SIZE)
+    assert f"{SIZE} bytes are asked for; {3 * SIZE} of {limit} are taken" in full.json()["errors"][0]["what"]
+    usage = tenant.get("/v1/usage").json()
+    assert usage == {"bytes": {"used": 3 * SIZE, "limit": limit}, "active_jobs": {"used": 0, "limit": 2}}
+    tenant.delete(f"/v1/uploads/{uploads[0]}")
+    announce(tenant, FILES)
+    assert tenant.post("/v1/uploads", json=BODY).status_code == 507
+    tenant.delete(f"/v1/scans/{scan_id}")
+    announce(tenant, FILES)
+
+
+def test_what_can_never_fit_is_another_answer(tenant: httpx.Client) -> None:
+    body = {"name": "s", "files": [{"name": "scan.json", "size": 4 * SIZE}]}
+    answer = tenant.post("/v1/uploads", json=body)
+    assert answer.status_code == 413 and f"{4 * SIZE} bytes together" in answer.json()["errors"][0]["what"]
+    assert tenant.get("/v1/usage").json()["bytes"]["used"] == 0
+
+
+def test_of_uploads_at_once_no_more_than_fit_are_taken(tenant: httpx.Client) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(lambda _: tenant.post("/v1/uploads", json=BODY).status_code, range(16)))
+    assert sorted(answers) == [201] * 3 + [507] * 13
+
+
+def test_a_tenant_s_jobs_at_a_time(narrow: Stack, tenant: httpx.Client) -> None:
+    scan_id = commit(tenant, FILES)
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(lambda _: tenant.post("/v1/jobs", json={"scan_id": scan_id}), range(8)))
+    assert sorted(answer.status_code for answer in answers) == [202] * 2 + [429] * 6
+    refused = tenant.put(f"/v1/jobs/{uuid4()}", json={"scan_id": scan_id})
+    assert refused.status_code == 429 and int(refused.headers["retry-after"]) > 0
+    assert "2 are queued or running, 2 may be" in refused.json()["errors"][0]["what"]
+    assert not list((narrow.data / "jobs").glob(".new-*")), "nothing is left of what was refused"
+    with narrow.client(narrow.new_key("another", "admin")[1]) as another:
+        submit(another, commit(another, FILES))
+    first = next(answer.json()["id"] for answer in answers if answer.status_code == 202)
+    tenant.post(f"/v1/jobs/{first}/cancel")
+    submit(tenant, scan_id)
+
+
+def test_a_repeated_submission_needs_no_second_place(tenant: httpx.Client) -> None:
+    scan_id, job_id = commit(tenant, FILES), uuid4()
+    submit(tenant, scan_id)
+    answers = [tenant.put(f"/v1/jobs/{job_id}", json={"scan_id": scan_id}).status_code for _ in range(2)]
+    assert answers == [202, 202]
+
+
+def test_a_key_that_asks_too_often_is_told_when_to_come_back(stack: Stack) -> None:
+    stack.server.terminate()
+    stack.server.wait()
+    stack.environment |= {"SPLATCT_RATE_PER_S": "1", "SPLATCT_RATE_BURST": "5"}
+    stack.start_server()
+    with stack.client(stack.new_key("a", "read")[1]) as fast, stack.client(stack.new_key("a", "read")[1]) as other:
+        answers = [fast.get("/v1/jobs") for _ in range(7)]
+        assert [answer.status_code for answer in answers] == [200] * 5 + [429] * 2
+        assert [answer.headers["ratelimit-remaining"] for answer in answers] == ["4", "3", "2", "1", "0", "0", "0"]
+        assert answers[0].headers["ratelimit-limit"] == "5" and int(answers[4].headers["ratelimit-reset"]) in (4, 5)
+        assert answers[6].json()["type"] == "urn:splatct:problem:too-many-requests"
+        assert other.get("/v1/jobs").status_code == 200
+        assert fast.get("/healthz").status_code == 200
+        time.sleep(int(answers[6].headers["retry-after"]))
+        assert fast.get("/v1/jobs").status_code == 200
+
+
+def test_trying_keys_is_slowed_down_and_locks_nobody_out(narrow: Stack) -> None:
+    _, good = narrow.new_key("a", "read")
+    with narrow.client() as http:
+        tried = [http.post("/v1/session", json={"key": f"splatct_aaaaaaaaaa_{n}"}) for n in range(8)]
+        assert [answer.status_code for answer in tried] == [401] * 6 + [429] * 2
+        assert 0 < int(tried[7].headers["retry-after"]) <= 10
+        assert http.post("/v1/session", json={"key": good}).status_code == 429, "the right one is not told apart"
+        bad = http.get("/v1/jobs", headers={"Authorization": "Bearer splatct_aaaaaaaaaa_x"})
+        assert bad.status_code == 429 and "retry-after" in bad.headers
+        assert http.get("/v1/jobs", headers={"Authorization": f"Bearer {good}"}).status_code == 200
+        assert http.get("/v1/jobs").status_code == 401, "who shows no key tries none"
+
+
+def test_buckets_fill_again_and_are_forgotten() -> None:
+    now = [0.0]
+    buckets = Buckets(2.0, 3, lambda: now[0])
+    taken = [buckets.take("a") for _ in range(4)]
+    assert [drawn.wait_s for drawn in taken if drawn] == [0.0, 0.0, 0.0, 0.5]
+    assert buckets.wait_s("a") == 0.5 and buckets.wait_s("b") == 0.0
+    now[0] = 0.5
+    again = buckets.take("a")
+    assert again is not None and again.wait_s == 0.0 and again.left == 0
+    for number in range(10_050):
+        buckets.take(str(number))
+        now[0] += 0.01
+    assert len(buckets._level) < 10_001, "addresses without end do not fill the memory"
+    assert Buckets(0.0, 1).take("a") is None
+
+
+def test_a_subscriber_is_one_however_many_addresses_it_has() -> None:
+    assert neighbourhood("2001:db8:1:2:3:4:5:6") == neighbourhood("2001:db8:1:2::9") != neighbourhood("2001:db8:1:3::9")
+    assert neighbourhood("192.0.2.1") != neighbourhood("192.0.2.2") and neighbourhood(None) == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "limit"),
+    [
+        ("POST", "/v1/session", 8 << 10),
+        ("POST", "/v1/jobs", 256 << 10),
+        ("PUT", f"/v1/jobs/{uuid4()}", 256 << 10),
+        ("POST", f"/v1/jobs/{uuid4()}/cancel", 256 << 10),
+        ("POST", "/v1/uploads", 16 << 20),
+        ("POST", f"/v1/uploads/{uuid4()}/commit", 16 << 10),
+        ("DELETE", f"/v1/scans/{uuid4()}", 16 << 10),
+        ("POST", "/healthz", 16 << 10),
+    ],
+)
+def test_every_body_has_an_end(shared: Stack, method: str, path: str, limit: int) -> None:
+    under = shared.http.request(method, path, content=b" " * limit).status_code
+    over = shared.http.request(method, path, content=b" " * (limit + 1))
+    assert under != 413 and over.status_code == 413 and over.headers["content-type"] == "application/problem+json"
+    assert str(limit) in over.json()["detail"]
+
+
+@pytest.mark.parametrize("body", [b"[" * 200_000, b'{"a":' * 40_000, b'{"scan_id": 1e999}', b"\xff\xfe", b"NaN"])
+def test_json_that_attacks_is_a_bad_request(shared: Stack, body: bytes) -> None:
+    answer = shared.http.post("/v1/jobs", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code in (400, 422) and answer.headers["content-type"] == "application/problem+json"
+
+
+def test_a_head_that_is_too_large(shared: Stack) -> None:
+    small = shared.http.get("/healthz", headers={"X-Long": "x" * (HEAD_BYTES - 1000)})
+    large = shared.http.get("/healthz", headers={"X-Long": "x" * HEAD_BYTES})
+    many = shared.http.get("/healthz", headers={f"X-{n}": "x" * 20 for n in range(1500)})
+    address = shared.http.get(f"/healthz?{'x' * HEAD_BYTES}")
+    assert [a.status_code for a in (small, large, many, address)] == [200, 431, 431, 431]
+    assert str(HEAD_BYTES) in large.json()["detail"]
+
+
+@pytest.mark.parametrize("start", [b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX-Long: ", b"GET /"])
+def test_a_head_that_never_ends_is_cut_off(shared: Stack, start: bytes) -> None:
+    before = resident(shared.server.pid)
+    with socket.create_connection(("127.0.0.1", shared.port), 10) as wire:
+        wire.sendall(start)
+        sent = 0
+        try:
+            while sent < 200 << 20:
+                wire.sendall(b"x" * (1 << 20))
+                sent += 1 << 20
+        except (BrokenPipeError, ConnectionResetError):
+            pass
+    assert sent < 20 << 20 and resident(shared.server.pid) - before < 20 << 20
+    assert shared.http.get("/healthz").status_code == 200
+
+
+def test_bodies_may_be_longer_than_heads(shared: Stack) -> None:
+    """On one connection, one after the other: the limit is on heads alone."""
+    for _ in range(3):
+        assert send(shared.http, FILES | {"more.bin": b"x" * (3 << 20)})
+
+
+def resident(pid: int) -> int:
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * 4096
