@@ -19,7 +19,7 @@ from starlette.types import Scope as Connection
 from server.keys import Key, KeyRing, Scope
 from server.problems import ApiProblem, answer
 from server.rates import Drawn, Rates, neighbourhood
-from server.sessions import COOKIE, CSRF_HEADER, Sessions, csrf_token
+from server.sessions import CSRF_HEADER, Sessions, cookie_name, csrf_token
 from splatcore.errors import Problem
 from worker.contract import LOCAL_TENANT
 
@@ -73,7 +73,7 @@ class Access:
         ring: KeyRing = request.app.state.keys
         if self._open_without_keys and not ring.exist():
             return LOCAL
-        given, token = request.headers.get("authorization"), request.cookies.get(COOKIE)
+        given, token = request.headers.get("authorization"), request.cookies.get(cookie_name(request.url.scheme))
         if given is None and token is not None:
             return _of_session(request, token)
         scheme, _, text = (given or "").partition(" ")

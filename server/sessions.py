@@ -16,7 +16,6 @@ import sqlalchemy as sa
 from server.keys import Key, KeyRing
 from worker.database import Database, metadata
 
-COOKIE = "splatct_session"
 CSRF_HEADER = "X-CSRF-Token"
 
 sessions = sa.Table(
@@ -63,6 +62,11 @@ class Sessions:
     def end(self, token: str) -> None:
         with self._database.writing() as write:
             write.execute(sessions.delete().where(sessions.c.digest == _digest(token)))
+
+
+def cookie_name(scheme: str) -> str:
+    """Over https a name that browsers let nobody else set: not plain http, and no other host of the same domain."""
+    return "__Host-splatct_session" if scheme == "https" else "splatct_session"
 
 
 def csrf_token(token: str) -> str:

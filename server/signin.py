@@ -12,7 +12,7 @@ from server.problems import ApiProblem
 from server.rates import Rates, neighbourhood
 from server.schema import SessionIn, SessionOut, moment
 from server.service import Served
-from server.sessions import COOKIE, Sessions, csrf_token
+from server.sessions import Sessions, cookie_name, csrf_token
 
 router = APIRouter(prefix="/v1/session", tags=["session"])
 
@@ -37,7 +37,7 @@ def sign_in(body: SessionIn, request: Request, response: Response) -> SessionOut
     session, token = sessions.begin(key)
     request.state.caller = caller = Caller.of(key, session.expires_at)
     response.set_cookie(
-        COOKIE,
+        cookie_name(request.url.scheme),
         token,
         max_age=sessions.last_s,
         path="/",
@@ -52,17 +52,18 @@ def sign_in(body: SessionIn, request: Request, response: Response) -> SessionOut
 def get_session(request: Request, service: Served) -> SessionOut:
     """Who the caller is, and what to send along as `X-CSRF-Token`."""
     assert service.caller is not None
-    token = request.cookies.get(COOKIE) if service.caller.session_ends is not None else None
+    token = request.cookies.get(cookie_name(request.url.scheme)) if service.caller.session_ends is not None else None
     return _out(service.caller, None if token is None else csrf_token(token))
 
 
 @router.delete("", status_code=204)
 def sign_out(request: Request, service: Served, response: Response) -> None:
     sessions: Sessions = request.app.state.sessions
-    token = request.cookies.get(COOKIE)
+    token = request.cookies.get(cookie_name(request.url.scheme))
     if token is not None:
         sessions.end(token)
-        response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
+        name, secure = cookie_name(request.url.scheme), request.url.scheme == "https"
+        response.delete_cookie(name, path="/", secure=secure, httponly=True, samesite="strict")
 
 
 def _out(caller: Caller, csrf: str | None) -> SessionOut:

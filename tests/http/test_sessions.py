@@ -43,8 +43,13 @@ def test_the_cookie_is_for_this_server_s_pages_alone(keyed: Stack) -> None:
         over_tls = http.post(
             "/v1/session", json={"key": keyed.new_key("first", "read")[1]}, headers={"X-Forwarded-Proto": "https"}
         )
-        (cookie,) = SimpleCookie(over_tls.headers["set-cookie"]).values()
-        assert cookie["secure"] is True and over_tls.headers["strict-transport-security"].startswith("max-age=")
+        ((name, cookie),) = SimpleCookie(over_tls.headers["set-cookie"]).items()
+        assert name.startswith("__Host-") and cookie["secure"] is True and cookie["domain"] == ""
+        tls, plain = {"X-Forwarded-Proto": "https"}, f"splatct_session={cookie.value}"
+        with keyed.client() as other:
+            assert other.get("/v1/jobs", headers={**tls, "Cookie": f"{name}={cookie.value}"}).status_code == 200
+            assert other.get("/v1/jobs", headers={**tls, "Cookie": plain}).status_code == 401, "set by somebody else"
+        assert over_tls.headers["strict-transport-security"].startswith("max-age=")
 
 
 def test_only_a_digest_of_the_session_is_kept(keyed: Stack, browser: httpx.Client) -> None:

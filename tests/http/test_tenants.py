@@ -93,7 +93,7 @@ class Two:
 
 @pytest.fixture(scope="module")
 def two(keyed: Stack) -> Iterator[Two]:
-    with keyed.client(keyed.new_key("second", "admin")[1]) as second:
+    with keyed.client(keyed.new_key("neighbour", "admin")[1]) as second:
         scan_id = commit(keyed.http, scan_files())
         upload_id = announce(keyed.http, scan_files())["id"]
         job_id = submit(keyed.http, scan_id)
@@ -148,6 +148,7 @@ def test_lists_hold_one_s_own(two: Two) -> None:
     assert two.job_id not in {job["id"] for job in two.second.get("/v1/jobs?limit=500").json()["jobs"]}
     assert two.second.get(f"/v1/jobs?before={two.job_id}").status_code == 404
     assert [scan["id"] for scan in two.second.get("/v1/scans").json()["scans"]] == [two.own_scan_id]
+    assert two.second.get("/v1/webhooks").json() == {"webhooks": []}
     assert two.own_scan_id not in {scan["id"] for scan in two.first.get("/v1/scans").json()["scans"]}
 
 
