@@ -15,7 +15,7 @@ from splatcore.options import Options
 _FEWEST_SPLATS, _MOST_SPLATS = 2_000, 2_000_000
 _COMPARED = {"r2": 50_000, "paper": 50_000}  # splats of the methods that start with a fixed number
 _PARAMETERS = 37  # float32 of a splat under optimisation: itself, raw parameters, Adam's moments
-_STATES = 6  # descents at once, at most, in memory and in a checkpoint
+_STATES = 8  # descents at once, at most, in memory and in a checkpoint
 _OF_NORMAL = {"preview": 0.3, "normal": 1.0, "fine": 1.5}  # time
 _OF_FULL = {"full": 1.0, "static": 0.9, "none": 0.6}
 _STEP_S = 0.034  # of the compared methods, with 50,000 splats and 512^2 pixels
@@ -45,7 +45,7 @@ def estimate(views: int, rows: int, cols: int, shape: Sequence[int], options: Op
     state = 4 * _PARAMETERS * _STATES * splats
     memory = 400e6 + 4 * (3 * pixels + 4 * voxels) + max(0, state - 50e6)
     if options.method == "splatct":
-        seconds = 45 * (pixels / (75 * 256**2)) ** 0.85 * max(1.0, voxels / max(pixels, 1)) ** 0.5
+        seconds = 60 * (pixels / (75 * 256**2)) ** 0.85 * max(1.0, voxels / max(pixels, 1)) ** 0.5
         seconds *= _OF_NORMAL[options.quality] * _OF_FULL[options.calibrate]
         seconds *= max(1.0, splats / default_splats(voxels)) ** 0.7
     else:
