@@ -4,6 +4,7 @@ SplatCTError
   ScanError             a scan folder cannot be used; lists every problem found
   OptionsError          an option is unknown, of the wrong type, or out of range
   ResultError           a result folder cannot be read or written
+  ExportError           another toolkit cannot describe these frames
   CheckpointError       a run's state cannot be gone on from
   ReconstructionError   the engine cannot go on (diverged, no signal in the data)
 
@@ -53,6 +54,10 @@ class OptionsError(SplatCTError):
 
 class ResultError(SplatCTError):
     """A result folder cannot be read or written."""
+
+
+class ExportError(SplatCTError):
+    """Another toolkit cannot describe these frames."""
 
 
 class CheckpointError(SplatCTError):

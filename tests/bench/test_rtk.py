@@ -12,6 +12,7 @@ import pytest
 from phantom import phantom
 
 from bench.paper.rtk.remote import RTK, RtkError
+from splatcore.export import rtk_geometry
 from splatcore.geometry import Frames, RigidMotions, circular
 from splatcore.grid import VolumeGrid
 from splatcore.scores import psnr
@@ -64,6 +65,19 @@ def test_geometry_xml_holds_every_view(rtk: RTK) -> None:
     assert text.count("<Matrix>") == 3
     distances = [float(value) for value in re.findall(r"<SourceToIsocenterDistance>([^<]+)<", text)]
     assert len(distances) == 3 and all(450 < d < 550 for d in distances)
+
+
+@pytest.mark.parametrize("how", [{}, {"flip_v": True}], ids=["plain", "upside down"])
+def test_its_own_writer_says_what_our_export_says(rtk: RTK, how: dict[str, bool]) -> None:
+    frames = askew(4, **how)
+    theirs, ours = (_numbers(text) for text in (rtk.geometry_xml(frames), rtk_geometry(frames)))
+    np.testing.assert_allclose(ours, theirs, atol=1e-6)
+
+
+def _numbers(text: str) -> np.ndarray:
+    """The matrices of a geometry file. [views, 12]"""
+    matrices = [re.sub(r"\s+", " ", m).split() for m in re.findall(r"<Matrix>([^<]*)</Matrix>", text)]
+    return np.array(matrices, float)
 
 
 def test_what_rtk_cannot_describe_is_refused(rtk: RTK) -> None:
