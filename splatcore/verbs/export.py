@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
             note += "; turn every projection upside down (flip rows)" if flipped else "; projections as they are"
             with renamed(args.out) as file:
                 file.write(text.encode())
-            said = {"flip_rows": flipped}
+            said: dict[str, str | bool] = {"flip_rows": flipped}
         else:
             kind = "cone_vec" if frames.beam == "cone" else "parallel3d_vec"
             note = f"astra.create_proj_geom('{kind}', {frames.rows}, {frames.cols}, vectors)"
