@@ -43,9 +43,10 @@ from server.quotas import Quotas
 from server.rates import Buckets, Rates
 from server.reconcile import Reconciler, keep_reconciling
 from server.rehearsal import DropUploads
+from server.reserve import Reserve
 from server.service import Service
 from server.sessions import Sessions
-from server.settings import Settings
+from server.settings import MIB, Settings
 from server.store import Store
 from server.watch import Watch
 from server.witness import Witness
@@ -78,12 +79,14 @@ def create_app(settings: Settings) -> FastAPI:
         reconciler = Reconciler(store.jobs, dispatcher, settings.data)
         outcomes, outbox = Outcomes(database), Outbox(database, settings.webhook_retry_s)
         quotas = Quotas(round(settings.tenant_gib * (1 << 30)), settings.tenant_jobs)
+        reserve = Reserve(settings.data, settings.disk_reserve_mib * MIB)
+        reserve.fill()
         loop, wake = asyncio.get_running_loop(), asyncio.Event()
 
         def wake_up() -> None:
             loop.call_soon_threadsafe(wake.set)
 
-        app.state.service = Service(settings, store, intake, watch, outcomes, quotas, wake_up)
+        app.state.service = Service(settings, store, intake, watch, outcomes, quotas, reserve, wake_up)
         app.state.metrics = Metrics(JobNumbers(Census(database), outcomes, reconciler, settings.data))
         app.state.dispatcher = dispatcher
         app.state.audit = AuditLog(database)

@@ -72,7 +72,8 @@ class Arrival:
         sync_folder(path.parent)
 
     def discard(self) -> None:
-        self._file.close()
+        with contextlib.suppress(OSError):  # on a full disk its last bytes cannot be written; nobody wants them
+            self._file.close()
         self._path.unlink(missing_ok=True)
 
 

@@ -14,6 +14,7 @@ from server.census import Outcomes
 from server.intake import Intake
 from server.problems import not_found
 from server.quotas import Quotas
+from server.reserve import Reserve
 from server.settings import Settings
 from server.store import Store
 from server.turns import Turns
@@ -30,6 +31,7 @@ class Service:
     watch: Watch
     outcomes: Outcomes
     quotas: Quotas
+    reserve: Reserve
     wake: Callable[[], None]  # have the reconcile loop look at once
     turns: Turns = field(default_factory=Turns)
     caller: Caller | None = None  # None: the server itself

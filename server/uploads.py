@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import shutil
 import threading
 from pathlib import Path as FolderPath
@@ -43,7 +42,12 @@ def create_upload(body: UploadIn, service: Served, response: Response) -> Upload
     size = sum(file.size for file in announced)
     _require_room(service, size)
     upload = service.store.add_upload(body.name, announced, service.quotas.room_for(service.tenant, size))
-    service.intake.create(upload.id)
+    try:
+        service.intake.create(upload.id)
+    except OSError:  # a full disk: what is not there must reserve nothing
+        service.reserve.deleting(lambda: service.store.drop_upload(upload.id))
+        service.intake.remove_upload(upload.id)
+        raise
     response.headers["Location"] = f"/v1/uploads/{upload.id}"
     return _upload_out(upload)
 
@@ -76,10 +80,6 @@ async def put_file(upload_id: UUID, name: FileName, request: Request, service: S
         raise not_found("upload") from None
     except Mismatch as mismatch:
         raise invalid(f"The file was refused: {mismatch}.", [Problem(name, str(mismatch), "send it again")]) from None
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        raise ApiProblem(507, "no-room", "The disk is full.") from None
     except ClientDisconnect:
         raise ApiProblem(400, "interrupted", "The connection ended before the file did.") from None
     return FileOut(name=name, size=file.size, received=file.size, complete=True, sha256=sha256)
@@ -91,12 +91,13 @@ def delete_upload(upload_id: UUID, service: Served) -> None:
         raise ApiProblem(409, "committed", "The upload is committed; delete the scan instead.")
     try:
         with service.intake.alone(str(upload_id), wait_s=2.0):
-            if service.store.drop_upload(str(upload_id)):
+            if service.reserve.deleting(lambda: service.store.drop_upload(str(upload_id))):
                 service.intake.remove_upload(str(upload_id))
     except Busy:
         raise ApiProblem(409, "busy", "Files of the upload are still arriving.", retry_after_s=2) from None
     except Gone:
-        service.store.drop_upload(str(upload_id))
+        service.reserve.deleting(lambda: service.store.drop_upload(str(upload_id)))
+    service.reserve.fill()
 
 
 @router.post("/{upload_id}/commit", status_code=201)
@@ -187,7 +188,9 @@ def _require_room(service: Service, size: int) -> None:
     free = shutil.disk_usage(service.settings.data).free
     spoken_for = service.store.outstanding_bytes() + service.settings.disk_floor_mib * MIB
     if size > free - spoken_for:
-        raise ApiProblem(507, "no-room", f"The disk has no room for {size} more bytes. Delete jobs or scans first.")
+        what = f"has {free} bytes free; {spoken_for} are spoken for or kept free, {size} are asked for"
+        fault = Problem("disk", what, "delete jobs, scans or open uploads first, which goes on working")
+        raise ApiProblem(507, "no-room", f"The disk has no room for {size} more bytes.", [fault])
 
 
 def _upload(service: Service, upload_id: UUID) -> Upload:

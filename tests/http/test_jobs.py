@@ -84,9 +84,6 @@ UNKNOWN = [
     ("POST", "/v1/jobs/{}/restart"),
     ("GET", "/v1/jobs/{}/partial"),
     ("GET", "/v1/jobs/{}/partial/volume.tif"),
-    ("GET", "/v1/webhooks/{}"),
-    ("DELETE", "/v1/webhooks/{}"),
-    ("GET", "/v1/webhooks/{}/deliveries"),
 ]
 
 
