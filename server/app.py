@@ -15,10 +15,10 @@ from fastapi.staticfiles import StaticFiles
 from server import (
     follow,
     health,
-    janitor,
     jobs,
     metrics,
     pages,
+    pins,
     problems,
     results,
     resume,
@@ -35,6 +35,7 @@ from server.deliveries import Outbox, keep_delivering
 from server.dispatch import Dispatcher
 from server.guard import Guard
 from server.intake import Intake
+from server.janitor import Janitor, keep_clean
 from server.keys import KeyRing
 from server.metrics import JobNumbers, Metrics
 from server.migrations import prepare
@@ -44,6 +45,7 @@ from server.rates import Buckets, Rates
 from server.reconcile import Reconciler, keep_reconciling
 from server.rehearsal import DropUploads
 from server.reserve import Reserve
+from server.retention import Rules
 from server.service import Service
 from server.sessions import Sessions
 from server.settings import MIB, Settings
@@ -99,7 +101,7 @@ def create_app(settings: Settings) -> FastAPI:
         tasks = [
             asyncio.create_task(keep_reconciling(reconciler, settings.reconcile_s, wake)),
             asyncio.create_task(watch.keep_looking()),
-            asyncio.create_task(janitor.keep_clean(store, intake, settings.data, settings.stale_upload_hours * 3600.0)),
+            asyncio.create_task(keep_clean(Janitor(store, intake, settings.data, Rules.of(settings), reserve))),
             asyncio.create_task(keep_delivering(outbox, settings.webhook_networks)),
         ]
         try:
@@ -127,7 +129,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(Access, open_without_keys=settings.may_be_open)
     app.add_middleware(Guard, allowed_hosts=settings.host_names)
     app.add_middleware(Observer)
-    for part in (signin, uploads, resume, scans, jobs, follow, results, health, metrics, usage, webhooks):
+    for part in (signin, uploads, resume, scans, jobs, follow, results, health, metrics, usage, webhooks, pins):
         app.include_router(part.router)
     app.include_router(pages.router)
     app.mount("/static", _Static(directory=Path(__file__).parent / "static"), name="static")

@@ -45,6 +45,7 @@ def scan_out(scan: Scan) -> ScanOut:
         name=scan.name,
         bytes=scan.bytes,
         facts=scan.facts,
+        pinned=scan.pinned,
         created_at=moment(scan.created_at),
         links={"self": f"/v1/scans/{scan.id}"},
     )

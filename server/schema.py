@@ -94,6 +94,7 @@ class ScanOut(BaseModel):
     name: str
     bytes: int
     facts: dict[str, Any]
+    pinned: bool = Field(description="kept, however old it grows")
     created_at: datetime
     links: dict[str, str]
 
@@ -121,6 +122,7 @@ class JobOut(BaseModel):
     attempt: int
     priority: PriorityName
     restart_of: str | None = Field(description="the job that it was made from")
+    pinned: bool = Field(description="kept, however old it grows")
     options: dict[str, Any]
     created_at: datetime
     started_at: datetime | None
@@ -145,6 +147,7 @@ class JobOut(BaseModel):
             attempt=job.attempt,
             priority=priority_name(job),
             restart_of=job.restart_of,
+            pinned=job.pinned,
             options=job.options,
             created_at=moment(job.created_at),
             started_at=None if job.started_at is None else moment(job.started_at),

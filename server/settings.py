@@ -34,7 +34,11 @@ class Settings(WorkerSettings):
     webhook_allow: str = ""  # private networks that webhooks may lead to, such as 10.1.0.0/16, comma between
     webhook_retry_s: float = Field(default=5.0, gt=0)  # before the second attempt; later pauses grow with it
     session_hours: float = Field(default=12.0, gt=0)  # of the page; then it asks for the key again
-    stale_upload_hours: float = 48.0
+    # How many days after their last use things are kept, unless they are pinned; 0: for ever.
+    keep_results_days: float = Field(default=0.0, ge=0)  # jobs that succeeded, after their end
+    keep_failed_days: float = Field(default=0.0, ge=0)  # jobs that failed or were cancelled, after their end
+    keep_scans_days: float = Field(default=0.0, ge=0)  # scans without a job, after the last one was sent or deleted
+    stale_upload_hours: float = 48.0  # open uploads, after the last byte; their clients are gone
     reconcile_s: float = 2.0
     log_format: Literal["json", "text"] = "json"
 

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from server.submissions import Claim, Submissions
 from worker.contract import LOCAL_TENANT, Priority
 from worker.database import Database, metadata
-from worker.ledger import Ledger
+from worker.ledger import Job, Ledger
 
 uploads = sa.Table(
     "uploads",
@@ -55,6 +55,8 @@ scans = sa.Table(
     sa.Column("facts", sa.JSON, nullable=False),
     sa.Column("created_at", sa.Float, nullable=False, index=True),
     sa.Column("tenant", sa.String(64), nullable=False, server_default=LOCAL_TENANT),
+    sa.Column("pinned", sa.Boolean, nullable=False, server_default=sa.false()),  # kept, however old it grows
+    sa.Column("used_at", sa.Float),  # when a job of it last came or went
     sa.Index("ix_scans_tenant_created_at", "tenant", "created_at"),
 )
 
@@ -101,6 +103,8 @@ class Scan:
     facts: dict[str, Any]
     created_at: float
     tenant: str
+    pinned: bool = False
+    used_at: float | None = None
 
 
 @dataclass(frozen=True)
@@ -210,11 +214,6 @@ class Store:
         with self.database.reading() as read:
             return int(read.execute(query.where(~uploads.c.committed, files.c.sha256.is_(None))).scalar_one())
 
-    def stale_uploads(self, before: float) -> list[str]:
-        query = sa.select(uploads.c.id).where(~uploads.c.committed, uploads.c.touched_at < before)
-        with self.database.reading() as read:
-            return list(read.execute(query).scalars())
-
     def drop_upload(self, upload_id: str) -> bool:
         """Forget an open upload."""
         is_open = sa.and_(uploads.c.id == upload_id, self._mine(uploads), ~uploads.c.committed)
@@ -246,6 +245,12 @@ class Store:
         with self.database.reading() as read:
             return [Scan(*row) for row in read.execute(query)]
 
+    def pin_scan(self, scan_id: str, pinned: bool) -> bool:
+        """Keep a scan from being cleaned away, or no longer; False if there is none."""
+        mine = sa.and_(scans.c.id == scan_id, self._mine(scans))
+        with self.database.writing() as write:
+            return write.execute(scans.update().where(mine).values(pinned=pinned)).rowcount == 1
+
     def drop_scan(self, scan_id: str) -> bool:
         """Forget a scan, and the upload it came from; False while a job needs it."""
         with self.database.writing() as write:
@@ -271,9 +276,16 @@ class Store:
             if write.execute(sa.select(scans.c.id).where(mine)).first() is None:
                 return False
             permit(write)
+            write.execute(scans.update().where(mine).values(used_at=time.time()))
             named = (scan.id, scan.name)
             self.jobs.add(write, job.id, job.name, named, job.options, job.priority, job.restart_of)
             if job.claim is not None:
                 self.submissions.add(write, job.claim, job.id)
             place()
             return True
+
+    def forget_job(self, job: Job) -> bool:
+        """Delete the row of a finished job. Its scan is unused from now on, not from whenever it was sent."""
+        with self.database.writing() as write:
+            write.execute(scans.update().where(scans.c.id == job.scan_id).values(used_at=time.time()))
+        return self.jobs.forget(job.id)

@@ -13,6 +13,7 @@ from server.migrations import (
     v0004_audit,
     v0005_webhooks,
     v0006_durable_jobs,
+    v0007_retention,
 )
 
 STEPS: tuple[Callable[[sa.Connection], None], ...] = (
@@ -22,4 +23,5 @@ STEPS: tuple[Callable[[sa.Connection], None], ...] = (
     v0004_audit.upgrade,
     v0005_webhooks.upgrade,
     v0006_durable_jobs.upgrade,
+    v0007_retention.upgrade,
 )

@@ -23,7 +23,7 @@ from server.settings import Settings
 from worker.jobfolder import JobFolder
 
 from ..postgres import running_postgres
-from .stack import PYTHONPATH, Stack, announce, commit, kill, scan_files, submit
+from .stack import PYTHONPATH, Stack, announce, commit, scan_files, submit
 
 
 def splatct(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -121,14 +121,21 @@ def test_a_backup_while_things_come_and_go_is_whole(stack: Stack, tmp_path: Path
         assert splatct("restore", str(folder), "--data", str(tmp_path / f"data-{number}")).returncode == 0
 
 
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a server that is gone: its `data`, and its `backup`."""
+    folder = tmp_path_factory.mktemp("original")
+    with Stack(folder) as stack:
+        stack.start_worker()
+        stack.wait(submit(stack.http, commit(stack.http, scan_files())), "succeeded")
+        backup(stack, folder / "backup")
+    return folder
+
+
 @pytest.fixture
-def made(stack: Stack, tmp_path: Path) -> Path:
-    """A small backup, its server gone."""
-    stack.start_worker()
-    stack.wait(submit(stack.http, commit(stack.http, scan_files())), "succeeded")
-    backup(stack, tmp_path / "backup")
-    kill(stack.server)
-    return tmp_path / "backup"
+def made(original: Path, tmp_path: Path) -> Path:
+    """A backup of one's own, to damage."""
+    return Path(shutil.copytree(original / "backup", tmp_path / "backup"))
 
 
 def test_a_damaged_backup_is_told_and_not_restored(made: Path, tmp_path: Path) -> None:
@@ -166,10 +173,10 @@ def test_a_link_in_a_backup_is_not_followed(made: Path, tmp_path: Path) -> None:
     assert refused.returncode == 1 and "log.txt: cannot be read" in refused.stderr
 
 
-def test_what_is_there_is_never_overwritten(stack: Stack, made: Path, tmp_path: Path) -> None:
-    over = splatct("restore", str(made), "--data", str(stack.data))
+def test_what_is_there_is_never_overwritten(original: Path, made: Path, tmp_path: Path) -> None:
+    over = splatct("restore", str(made), "--data", str(original / "data"))
     assert over.returncode == 1 and "is not an empty folder" in over.stderr
-    again = splatct("backup", str(made), "--data", str(stack.data))
+    again = splatct("backup", str(made), "--data", str(original / "data"))
     assert again.returncode == 1 and "exists, expected the name of a new folder" in again.stderr
     inside = splatct("restore", str(made), "--data", str(made / "data"))
     assert inside.returncode == 1 and "lies in the backup itself" in inside.stderr

@@ -82,6 +82,10 @@ UNKNOWN = [
     ("GET", "/v1/jobs/{}/slices/x/0.png"),
     ("GET", "/v1/jobs/{}/report"),
     ("POST", "/v1/jobs/{}/restart"),
+    ("POST", "/v1/jobs/{}/pin"),
+    ("DELETE", "/v1/jobs/{}/pin"),
+    ("POST", "/v1/scans/{}/pin"),
+    ("DELETE", "/v1/scans/{}/pin"),
     ("GET", "/v1/jobs/{}/partial"),
     ("GET", "/v1/jobs/{}/partial/volume.tif"),
 ]

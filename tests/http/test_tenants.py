@@ -38,6 +38,10 @@ FOREIGN = [
     "PUT /v1/jobs/{job_id}",
     "GET /v1/jobs/{job_id}",
     "POST /v1/jobs/{job_id}/restart",
+    "POST /v1/jobs/{job_id}/pin",
+    "DELETE /v1/jobs/{job_id}/pin",
+    "POST /v1/scans/{scan_id}/pin",
+    "DELETE /v1/scans/{scan_id}/pin",
     "POST /v1/jobs/{job_id}/cancel",
     "DELETE /v1/jobs/{job_id}",
     "GET /v1/jobs/{job_id}/events",
@@ -86,7 +90,7 @@ class Two:
             }
         if path.endswith("/restart"):
             more["json"] = {}
-        elif method in ("POST", "PUT") and "/jobs" in path and "cancel" not in path:
+        elif method in ("POST", "PUT") and "/jobs" in path and not path.endswith(("/cancel", "/pin")):
             more["json"] = {"scan_id": self.own_scan_id}
         return http.request(method, url, **more)
 
