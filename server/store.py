@@ -35,7 +35,7 @@ files = sa.Table(
     sa.Column("position", sa.Integer, nullable=False),
     sa.Column("size", sa.BigInteger, nullable=False),
     sa.Column("expected_sha256", sa.String(64)),
-    sa.Column("sha256", sa.String(64)),  # of the bytes on disk; null until complete
+    sa.Column("sha256", sa.String(64), index=True),  # of the bytes on disk; null until complete
 )
 
 parts = sa.Table(
@@ -124,6 +124,13 @@ def _always(_write: sa.Connection) -> None:
     """For who has no quota."""
 
 
+def _file_rows(upload_id: str, announced: Sequence[File], first: int) -> list[dict[str, Any]]:
+    return [
+        {"upload_id": upload_id, "position": n, "name": f.name, "size": f.size, "expected_sha256": f.expected_sha256}
+        for n, f in enumerate(announced, first)
+    ]
+
+
 class Store:
     """Everything the server keeps, on one database.
 
@@ -148,21 +155,12 @@ class Store:
     def add_upload(self, name: str, announced: Sequence[File], permit: Permit = _always) -> Upload:
         """`permit` may refuse by raising; it sees what there is, and what comes after it cannot change that."""
         upload_id, now = str(uuid4()), time.time()
-        rows = [
-            {
-                "upload_id": upload_id,
-                "position": n,
-                "name": f.name,
-                "size": f.size,
-                "expected_sha256": f.expected_sha256,
-            }
-            for n, f in enumerate(announced)
-        ]
         with self.database.writing() as write:
             permit(write)
             row = {"id": upload_id, "name": name, "committed": False, "created_at": now, "touched_at": now}
             write.execute(uploads.insert().values(**row, tenant=self.tenant or LOCAL_TENANT))
-            write.execute(files.insert(), rows)
+            if announced:
+                write.execute(files.insert(), _file_rows(upload_id, announced, 0))
         return Upload(upload_id, name, False, now, tuple(announced))
 
     def upload(self, upload_id: str) -> Upload | None:
@@ -196,6 +194,31 @@ class Store:
             write.execute(files.update().where(mine).values(sha256=sha256))
             write.execute(parts.delete().where(parts.c.upload_id == upload_id, parts.c.name == name))
             write.execute(uploads.update().where(uploads.c.id == upload_id).values(touched_at=time.time()))
+
+    def received_all(self, upload_id: str, digests: dict[str, str]) -> None:
+        """Files that are complete without having been sent, by name."""
+        with self.database.writing() as write:
+            for name, sha256 in digests.items():
+                mine = sa.and_(files.c.upload_id == upload_id, files.c.name == name)
+                write.execute(files.update().where(mine).values(sha256=sha256))
+
+    def add_files(
+        self, upload_id: str, judge: Callable[[Sequence[File]], list[File]], permit: Callable[[int], Permit]
+    ) -> list[File] | None:
+        """Announce more files of an open upload; None if it is none. `judge` is shown the files that are there, and
+        says which are to be added, or refuses by raising, as `permit` for the bytes of these may."""
+        with self.database.writing() as write:
+            is_open = sa.and_(uploads.c.id == upload_id, self._mine(uploads), ~uploads.c.committed)
+            touched = uploads.update().where(is_open).values(touched_at=time.time())
+            if not write.execute(touched).rowcount:  # this row is ours until the end: others who add files wait
+                return None
+            columns = (files.c.name, files.c.size, files.c.expected_sha256, files.c.sha256)
+            there = [File(*row) for row in write.execute(sa.select(*columns).where(files.c.upload_id == upload_id))]
+            new = judge(there)
+            permit(sum(file.size for file in new))(write)
+            if new:
+                write.execute(files.insert(), _file_rows(upload_id, new, len(there)))
+        return new
 
     def acknowledge(self, upload_id: str, name: str, offset: int) -> None:
         """So many bytes of a file that arrives in pieces are durable."""

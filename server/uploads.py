@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import threading
 from pathlib import Path as FolderPath
 from typing import Annotated
@@ -12,13 +11,13 @@ from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
 from starlette.requests import ClientDisconnect
 
-from server import names
+from server.announce import announced, open_upload, require_scan_json
 from server.checking import CheckFailed, check_scan
 from server.intake import Arrival, Busy, Gone, Mismatch
 from server.partial import remove_part
 from server.problems import ApiProblem, invalid, not_found
 from server.scans import scan_out
-from server.schema import FileIn, FileOut, ScanOut, UploadIn, UploadOut, moment
+from server.schema import FileOut, ScanOut, UploadIn, UploadOut, moment
 from server.service import Served, Service
 from server.settings import MIB
 from server.store import File, Scan, Upload
@@ -35,19 +34,9 @@ FileName = Annotated[str, Path(max_length=1024)]
 
 @router.post("", status_code=201)
 def create_upload(body: UploadIn, service: Served, response: Response) -> UploadOut:
-    problems = _announcement_problems(body.files)
-    if problems:
-        raise invalid("The announced files cannot be accepted.", problems[:200])
-    announced = [File(f.name, f.size, f.sha256.lower() if f.sha256 else None, None) for f in body.files]
-    size = sum(file.size for file in announced)
-    _require_room(service, size)
-    upload = service.store.add_upload(body.name, announced, service.quotas.room_for(service.tenant, size))
-    try:
-        service.intake.create(upload.id)
-    except OSError:  # a full disk: what is not there must reserve nothing
-        service.reserve.deleting(lambda: service.store.drop_upload(upload.id))
-        service.intake.remove_upload(upload.id)
-        raise
+    files = announced(body.files)
+    require_scan_json(files)
+    upload = open_upload(service, body.name, files)
     response.headers["Location"] = f"/v1/uploads/{upload.id}"
     return _upload_out(upload)
 
@@ -166,31 +155,6 @@ async def _receive(request: Request, service: Service, upload_id: str, file: Fil
         return sha256
     finally:
         await to_thread.run_sync(arrival.discard, abandon_on_cancel=False)
-
-
-def _announcement_problems(files: list[FileIn]) -> list[Problem]:
-    problems, seen = [], set()
-    for position, file in enumerate(files):
-        where = f"files/{position}/name"
-        fault = names.fault(file.name)
-        if fault is not None:
-            problems.append(Problem(where, f"the name {fault}", "use plain names without folders"))
-        elif names.key(file.name) in seen:
-            problems.append(Problem(where, "the name is taken by another file of this upload"))
-        seen.add(names.key(file.name))
-    if all(file.name != "scan.json" for file in files):
-        problems.append(Problem("files", "scan.json is not among them", "it describes the scan; see docs/http.md"))
-    return problems
-
-
-def _require_room(service: Service, size: int) -> None:
-    """Refuse what will not fit, counting what open uploads still have to send."""
-    free = shutil.disk_usage(service.settings.data).free
-    spoken_for = service.store.outstanding_bytes() + service.settings.disk_floor_mib * MIB
-    if size > free - spoken_for:
-        what = f"has {free} bytes free; {spoken_for} are spoken for or kept free, {size} are asked for"
-        fault = Problem("disk", what, "delete jobs, scans or open uploads first, which goes on working")
-        raise ApiProblem(507, "no-room", f"The disk has no room for {size} more bytes.", [fault])
 
 
 def _upload(service: Service, upload_id: UUID) -> Upload:

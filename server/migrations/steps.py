@@ -14,6 +14,7 @@ from server.migrations import (
     v0005_webhooks,
     v0006_durable_jobs,
     v0007_retention,
+    v0008_contents,
 )
 
 STEPS: tuple[Callable[[sa.Connection], None], ...] = (
@@ -24,4 +25,5 @@ STEPS: tuple[Callable[[sa.Connection], None], ...] = (
     v0005_webhooks.upgrade,
     v0006_durable_jobs.upgrade,
     v0007_retention.upgrade,
+    v0008_contents.upgrade,
 )
