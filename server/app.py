@@ -13,8 +13,10 @@ from fastapi import FastAPI, Response
 from fastapi.staticfiles import StaticFiles
 
 from server import (
+    adding,
     follow,
     health,
+    imports,
     jobs,
     metrics,
     pages,
@@ -34,6 +36,7 @@ from server.census import Census, Outcomes
 from server.deliveries import Outbox, keep_delivering
 from server.dispatch import Dispatcher
 from server.guard import Guard
+from server.importing import roots
 from server.intake import Intake
 from server.janitor import Janitor, keep_clean
 from server.keys import KeyRing
@@ -83,12 +86,13 @@ def create_app(settings: Settings) -> FastAPI:
         quotas = Quotas(round(settings.tenant_gib * (1 << 30)), settings.tenant_jobs)
         reserve = Reserve(settings.data, settings.disk_reserve_mib * MIB)
         reserve.fill()
+        import_roots = roots(settings.import_from, settings.data)
         loop, wake = asyncio.get_running_loop(), asyncio.Event()
 
         def wake_up() -> None:
             loop.call_soon_threadsafe(wake.set)
 
-        app.state.service = Service(settings, store, intake, watch, outcomes, quotas, reserve, wake_up)
+        app.state.service = Service(settings, store, intake, watch, outcomes, quotas, reserve, wake_up, import_roots)
         app.state.metrics = Metrics(JobNumbers(Census(database), outcomes, reconciler, settings.data))
         app.state.dispatcher = dispatcher
         app.state.audit = AuditLog(database)
@@ -129,7 +133,22 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(Access, open_without_keys=settings.may_be_open)
     app.add_middleware(Guard, allowed_hosts=settings.host_names)
     app.add_middleware(Observer)
-    for part in (signin, uploads, resume, scans, jobs, follow, results, health, metrics, usage, webhooks, pins):
+    for part in (
+        signin,
+        uploads,
+        resume,
+        scans,
+        jobs,
+        follow,
+        results,
+        health,
+        metrics,
+        usage,
+        webhooks,
+        pins,
+        adding,
+        imports,
+    ):
         app.include_router(part.router)
     app.include_router(pages.router)
     app.mount("/static", _Static(directory=Path(__file__).parent / "static"), name="static")

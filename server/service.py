@@ -11,6 +11,7 @@ from fastapi import Depends, Request
 
 from server.access import Caller
 from server.census import Outcomes
+from server.importing import Root
 from server.intake import Intake
 from server.problems import not_found
 from server.quotas import Quotas
@@ -33,6 +34,7 @@ class Service:
     quotas: Quotas
     reserve: Reserve
     wake: Callable[[], None]  # have the reconcile loop look at once
+    imports: tuple[Root, ...] = ()  # folders that scans may be imported from
     turns: Turns = field(default_factory=Turns)
     caller: Caller | None = None  # None: the server itself
 

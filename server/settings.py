@@ -26,6 +26,7 @@ class Settings(WorkerSettings):
     check_memory_mib: int = 8192  # address space of that check; a hostile TIFF gets no further
     disk_floor_mib: int = 512  # kept free: no upload may take the last of the disk
     disk_reserve_mib: int = Field(default=8, ge=0)  # held by a file, so that a full disk still lets things be deleted
+    import_from: str = ""  # folders of this machine that tenants may import scans from: TENANT=FOLDER, comma between
     tenant_gib: float = Field(default=0.0, ge=0)  # of uploads and scans that one tenant may keep; 0: no limit
     tenant_jobs: int = Field(default=0, ge=0)  # of one tenant that may wait and run together; 0: no limit
     rate_per_s: float = Field(default=50.0, ge=0)  # requests of one key, on the long run; 0: no limit

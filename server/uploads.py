@@ -11,6 +11,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
 from starlette.requests import ClientDisconnect
 
+from server.adding import file_out
 from server.announce import announced, open_upload, require_scan_json
 from server.checking import CheckFailed, check_scan
 from server.intake import Arrival, Busy, Gone, Mismatch
@@ -35,15 +36,16 @@ FileName = Annotated[str, Path(max_length=1024)]
 @router.post("", status_code=201)
 def create_upload(body: UploadIn, service: Served, response: Response) -> UploadOut:
     files = announced(body.files)
-    require_scan_json(files)
+    if not body.growing:
+        require_scan_json(files)
     upload = open_upload(service, body.name, files)
     response.headers["Location"] = f"/v1/uploads/{upload.id}"
-    return _upload_out(upload)
+    return upload_out(upload)
 
 
 @router.get("/{upload_id}")
 def get_upload(upload_id: UUID, service: Served) -> UploadOut:
-    return _upload_out(_upload(service, upload_id))
+    return upload_out(_upload(service, upload_id))
 
 
 @router.put(
@@ -112,9 +114,11 @@ def _commit(service: Service, upload: Upload) -> Scan | None:
     if upload.committed:
         return None
     missing = upload.missing()
+    if all(file.name != "scan.json" for file in upload.files):
+        missing = ["scan.json", *missing]  # an upload that grew, and was never told of it
     if missing:
         problems = [Problem(name, "is missing", "send it, then commit again") for name in missing[:200]]
-        raise ApiProblem(409, "incomplete", f"{len(missing)} of {len(upload.files)} files are missing.", problems)
+        raise ApiProblem(409, "incomplete", f"{len(missing)} files are missing.", problems)
     if not _checks.acquire(timeout=COMMIT_WAIT_S):
         raise ApiProblem(503, "busy", "Other scans are being checked.", retry_after_s=5)
     try:
@@ -164,19 +168,15 @@ def _upload(service: Service, upload_id: UUID) -> Upload:
     return upload
 
 
-def _upload_out(upload: Upload) -> UploadOut:
+def upload_out(upload: Upload) -> UploadOut:
     base = f"/v1/uploads/{upload.id}"
     links = {"self": base}
     links |= {"scan": f"/v1/scans/{upload.id}"} if upload.committed else {"commit": f"{base}/commit"}
-    files = [
-        FileOut(name=f.name, size=f.size, received=f.received, complete=bool(f.sha256), sha256=f.sha256)
-        for f in upload.files
-    ]
     return UploadOut(
         id=upload.id,
         name=upload.name,
         state="committed" if upload.committed else "open",
-        files=files,
+        files=[file_out(file) for file in upload.files],
         scan_id=upload.id if upload.committed else None,
         created_at=moment(upload.created_at),
         links=links,

@@ -22,6 +22,8 @@ log = logging.getLogger("splatct.audit")
 
 ACTIONS = {
     ("POST", "/v1/uploads"): "upload",
+    ("POST", "/v1/uploads/{upload_id}/files"): "upload",
+    ("POST", "/v1/imports"): "import",
     ("POST", "/v1/uploads/{upload_id}/commit"): "commit",
     ("DELETE", "/v1/uploads/{upload_id}"): "delete-upload",
     ("DELETE", "/v1/scans/{scan_id}"): "delete-scan",

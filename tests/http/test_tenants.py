@@ -32,6 +32,7 @@ FOREIGN = [
     "PATCH /v1/uploads/{upload_id}/files/{name}",
     "HEAD /v1/uploads/{upload_id}/files/{name}",
     "DELETE /v1/uploads/{upload_id}",
+    "POST /v1/uploads/{upload_id}/files",
     "POST /v1/uploads/{upload_id}/commit",
     "GET /v1/scans/{scan_id}",
     "DELETE /v1/scans/{scan_id}",
@@ -57,7 +58,10 @@ FOREIGN = [
     "GET /v1/webhooks/{webhook_id}/deliveries",
     "DELETE /v1/webhooks/{webhook_id}",
 ]
-IN_BODY = {"POST /v1/jobs", "POST /v1/jobs/validate"}
+IN_BODY = {
+    "POST /v1/jobs", "POST /v1/jobs/validate",
+    "POST /v1/imports",  # names a folder of the tenant's: see test_importing.py
+}  # fmt: skip
 
 
 @dataclass
@@ -88,6 +92,8 @@ class Two:
                 "content": b"x",
                 "headers": {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"},
             }
+        if path.endswith("/files"):
+            more["json"] = {"files": [{"name": "more.tif", "size": 1}]}
         if path.endswith("/restart"):
             more["json"] = {}
         elif method in ("POST", "PUT") and "/jobs" in path and not path.endswith(("/cancel", "/pin")):
