@@ -112,7 +112,8 @@ def _settle(store: Store, data: Path, manifest: Manifest) -> Restored:
     for job in waiting:
         folder = JobFolder(data, job.id)
         folder.scan.mkdir(exist_ok=True)
-        for file in (data / "scans" / job.scan_id).iterdir():
+        scan = data / "scans" / job.scan_id
+        for file in scan.iterdir() if scan.is_dir() else ():  # without one the job will fail, and say so
             link_or_copy(file, folder.scan / file.name)
         folder.lock_file.touch()
         sync_folder(folder.scan)

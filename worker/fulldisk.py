@@ -9,7 +9,7 @@ from sqlalchemy.exc import DBAPIError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 # SQLite says "full" where it writes, and "I/O error" where it cannot make its shared index larger.
-_SQLITE = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_SHMSIZE, sqlite3.SQLITE_IOERR_WRITE)
+_SQLITE = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_SHMSIZE)
 _POSTGRESQL = "53100"
 
 
