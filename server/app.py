@@ -13,12 +13,14 @@ from fastapi import FastAPI, Response
 from fastapi.staticfiles import StaticFiles
 
 from server import (
+    adding,
     follow,
     health,
-    janitor,
+    imports,
     jobs,
     metrics,
     pages,
+    pins,
     problems,
     results,
     resume,
@@ -34,7 +36,9 @@ from server.census import Census, Outcomes
 from server.deliveries import Outbox, keep_delivering
 from server.dispatch import Dispatcher
 from server.guard import Guard
+from server.importing import roots
 from server.intake import Intake
+from server.janitor import Janitor, keep_clean
 from server.keys import KeyRing
 from server.metrics import JobNumbers, Metrics
 from server.migrations import prepare
@@ -43,9 +47,11 @@ from server.quotas import Quotas
 from server.rates import Buckets, Rates
 from server.reconcile import Reconciler, keep_reconciling
 from server.rehearsal import DropUploads
+from server.reserve import Reserve
+from server.retention import Rules
 from server.service import Service
 from server.sessions import Sessions
-from server.settings import Settings
+from server.settings import MIB, Settings
 from server.store import Store
 from server.watch import Watch
 from server.witness import Witness
@@ -78,12 +84,15 @@ def create_app(settings: Settings) -> FastAPI:
         reconciler = Reconciler(store.jobs, dispatcher, settings.data)
         outcomes, outbox = Outcomes(database), Outbox(database, settings.webhook_retry_s)
         quotas = Quotas(round(settings.tenant_gib * (1 << 30)), settings.tenant_jobs)
+        reserve = Reserve(settings.data, settings.disk_reserve_mib * MIB)
+        reserve.fill()
+        import_roots = roots(settings.import_from, settings.data)
         loop, wake = asyncio.get_running_loop(), asyncio.Event()
 
         def wake_up() -> None:
             loop.call_soon_threadsafe(wake.set)
 
-        app.state.service = Service(settings, store, intake, watch, outcomes, quotas, wake_up)
+        app.state.service = Service(settings, store, intake, watch, outcomes, quotas, reserve, wake_up, import_roots)
         app.state.metrics = Metrics(JobNumbers(Census(database), outcomes, reconciler, settings.data))
         app.state.dispatcher = dispatcher
         app.state.audit = AuditLog(database)
@@ -96,7 +105,7 @@ def create_app(settings: Settings) -> FastAPI:
         tasks = [
             asyncio.create_task(keep_reconciling(reconciler, settings.reconcile_s, wake)),
             asyncio.create_task(watch.keep_looking()),
-            asyncio.create_task(janitor.keep_clean(store, intake, settings.data, settings.stale_upload_hours * 3600.0)),
+            asyncio.create_task(keep_clean(Janitor(store, intake, settings.data, Rules.of(settings), reserve))),
             asyncio.create_task(keep_delivering(outbox, settings.webhook_networks)),
         ]
         try:
@@ -124,7 +133,22 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(Access, open_without_keys=settings.may_be_open)
     app.add_middleware(Guard, allowed_hosts=settings.host_names)
     app.add_middleware(Observer)
-    for part in (signin, uploads, resume, scans, jobs, follow, results, health, metrics, usage, webhooks):
+    for part in (
+        signin,
+        uploads,
+        resume,
+        scans,
+        jobs,
+        follow,
+        results,
+        health,
+        metrics,
+        usage,
+        webhooks,
+        pins,
+        adding,
+        imports,
+    ):
         app.include_router(part.router)
     app.include_router(pages.router)
     app.mount("/static", _Static(directory=Path(__file__).parent / "static"), name="static")

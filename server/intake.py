@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Protocol
 from uuid import uuid4
 
-from worker.jobfolder import sync_folder
+from worker.jobfolder import link_or_copy, sync_file, sync_folder
 
 
 class Busy(Exception):
@@ -72,7 +72,8 @@ class Arrival:
         sync_folder(path.parent)
 
     def discard(self) -> None:
-        self._file.close()
+        with contextlib.suppress(OSError):  # on a full disk its last bytes cannot be written; nobody wants them
+            self._file.close()
         self._path.unlink(missing_ok=True)
 
 
@@ -114,6 +115,17 @@ class Intake:
         with self._settling:
             arrival.move_to(self.settled(upload_id, name))
             record()
+
+    def adopt(self, upload_id: str, name: str, scan_id: str, source: str) -> None:
+        """Give an upload a file that a scan has: another name of it, or a copy where the file system has no links. Both
+        are only ever replaced, never written to. Raises FileNotFoundError if the scan is gone."""
+        target = self.settled(upload_id, name)
+        target.unlink(missing_ok=True)  # a copy would write into what is there, under whatever other names
+        link_or_copy(self._scans / scan_id / source, target)
+        sync_file(target)
+
+    def sync(self, upload_id: str) -> None:
+        sync_folder(self._uploads / upload_id / "scan")
 
     def settled(self, upload_id: str, name: str) -> Path:
         return self._uploads / upload_id / "scan" / name

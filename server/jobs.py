@@ -87,11 +87,12 @@ def restart_job(
 
 @router.delete("/jobs/{job_id}", status_code=204)
 def delete_job(job_id: UUID, service: Served) -> None:
-    service.job(job_id)
+    job = service.job(job_id)
     service.outcomes.catch_up()
-    if not service.store.jobs.forget(str(job_id)):
+    if not service.reserve.deleting(lambda: service.store.forget_job(job)):
         raise ApiProblem(409, "not-finished", "The job has not finished; cancel it first.")
     service.folder(str(job_id)).remove()
+    service.reserve.fill()
 
 
 @router.get("/jobs/{job_id}/events")

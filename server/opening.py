@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
+from server.importing import roots
 from server.keys import KeyRing
 from server.migrations import prepare
 from server.settings import Settings, SettingsError
@@ -28,5 +29,6 @@ def opened(settings: Settings) -> Iterator[Database]:
 def make_ready(settings: Settings) -> None:
     """Raises, too, if others could reach a server that has no keys."""
     settings.webhook_networks  # noqa: B018  raises for what is no network
+    roots(settings.import_from, settings.data)
     with opened(settings) as database:
         settings.require_door(KeyRing(database).exist())

@@ -13,11 +13,13 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from sqlalchemy.exc import DBAPIError
 from starlette.exceptions import HTTPException
 
 from server.headers import add_to
 from server.logs import request_id
 from splatcore.errors import Problem
+from worker.fulldisk import is_full
 
 log = logging.getLogger("splatct.server")
 
@@ -50,6 +52,11 @@ def not_found(what: str) -> ApiProblem:
 
 def invalid(detail: str, errors: Sequence[Problem] = ()) -> ApiProblem:
     return ApiProblem(422, "invalid", detail, errors)
+
+
+def disk_is_full(headers: Mapping[str, str] | None = None) -> ApiProblem:
+    fault = Problem("disk", "is full", "nothing was lost: delete jobs or scans, which goes on working, then try again")
+    return ApiProblem(507, "no-room", "The server's disk is full.", [fault], headers=headers)
 
 
 def response(
@@ -88,6 +95,14 @@ async def _on_invalid(_request: Request, error: Exception) -> JSONResponse:
     return response(422, "invalid", "The request is not what this call expects.", errors)
 
 
+async def _on_full(request: Request, error: Exception) -> JSONResponse:
+    """A disk that is full is nobody's bug, and passes; anything else of these kinds is."""
+    if not is_full(error):
+        raise error
+    log.error("%s %s: the disk is full", request.method, request.url.path)
+    return answer(disk_is_full())
+
+
 async def _on_bug(request: Request, error: Exception) -> JSONResponse:
     log.error("%s %s failed", request.method, request.url.path, exc_info=error)
     current = request_id.get()  # this answer is made outside of the middleware that names all others
@@ -108,4 +123,6 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(ApiProblem, _on_problem)
     app.add_exception_handler(HTTPException, _on_http)
     app.add_exception_handler(RequestValidationError, _on_invalid)
+    app.add_exception_handler(OSError, _on_full)
+    app.add_exception_handler(DBAPIError, _on_full)
     app.add_exception_handler(Exception, _on_bug)

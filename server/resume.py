@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 from collections.abc import AsyncIterator
 from typing import Annotated
 from uuid import UUID
@@ -11,17 +10,19 @@ from uuid import UUID
 import anyio
 from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
+from sqlalchemy.exc import DBAPIError
 from starlette.requests import ClientDisconnect
 
 from server.digests import TUS_ALGORITHMS, BadDigest, Claim, claims, content_digest
 from server.intake import Busy, Gone, Mismatch
 from server.partial import Partial, take_back
-from server.problems import ApiProblem, invalid, not_found
+from server.problems import ApiProblem, disk_is_full, invalid, not_found
 from server.service import Served, Service
 from server.settings import MIB
 from server.store import File
 from server.turns import Turn
 from splatcore.errors import Problem
+from worker.fulldisk import is_full
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
@@ -150,16 +151,16 @@ async def _receive(request: Request, turn: Turn, name: str, partial: Partial, di
     except Mismatch as mismatch:
         await to_thread.run_sync(partial.drop_chunk)
         raise _refused(name, partial.offset, str(mismatch)) from None
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+    except (OSError, DBAPIError) as error:
+        if not is_full(error):
             raise
         await to_thread.run_sync(partial.drop_chunk)
-        raise _problem(507, "no-room", "The disk is full; go on when there is room.", partial) from None
+        raise _full(partial) from None
     broken = next((claim for claim in digests if not claim.holds()), None)
     if digests and (cut or taken_over or broken):
         await to_thread.run_sync(partial.drop_chunk)
     else:
-        await to_thread.run_sync(partial.acknowledge)
+        await _acknowledged(partial)
     if taken_over:
         raise _problem(409, "taken-over", "A newer request writes this file now.", partial)
     if cut:
@@ -167,6 +168,16 @@ async def _receive(request: Request, turn: Turn, name: str, partial: Partial, di
     if broken:
         errors = [Problem(broken.header, "is not the digest of the bytes that arrived", f"send again from {start}")]
         raise _problem(broken.status, "digest-mismatch", "The chunk was damaged and is dropped.", partial, errors)
+
+
+async def _acknowledged(partial: Partial) -> None:
+    try:
+        await to_thread.run_sync(partial.acknowledge)
+    except (OSError, DBAPIError) as error:  # some file systems find room for what was written only now
+        if not is_full(error):
+            raise
+        await to_thread.run_sync(partial.drop_chunk)
+        raise _full(partial) from None
 
 
 async def _digested(partial: Partial, digests: list[Claim], block: bytes) -> None:
@@ -232,6 +243,10 @@ def _claims(request: Request) -> list[Claim]:
 def _standing(file: File, offset: int, sha256: str | None) -> dict[str, str]:
     headers = {"Upload-Offset": str(offset), "Upload-Length": str(file.size), "Cache-Control": "no-store"}
     return TUS | headers | ({"Repr-Digest": content_digest(sha256)} if sha256 else {})
+
+
+def _full(partial: Partial) -> ApiProblem:
+    return disk_is_full(headers=TUS | {"Upload-Offset": str(partial.offset)})
 
 
 def _refused(name: str, offset: int, what: str) -> ApiProblem:

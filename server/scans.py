@@ -31,11 +31,12 @@ def get_scan(scan_id: UUID, service: Served) -> ScanOut:
 def delete_scan(scan_id: UUID, service: Served) -> None:
     if service.store.scan(str(scan_id)) is None:
         raise not_found("scan")
-    if not service.store.drop_scan(str(scan_id)):
+    if not service.reserve.deleting(lambda: service.store.drop_scan(str(scan_id))):
         if service.store.scan(str(scan_id)) is None:  # deleted by another request just now
             raise not_found("scan")
         raise ApiProblem(409, "in-use", "A job that has not finished needs this scan.")
     service.intake.remove_scan(str(scan_id))
+    service.reserve.fill()
 
 
 def scan_out(scan: Scan) -> ScanOut:
@@ -44,6 +45,7 @@ def scan_out(scan: Scan) -> ScanOut:
         name=scan.name,
         bytes=scan.bytes,
         facts=scan.facts,
+        pinned=scan.pinned,
         created_at=moment(scan.created_at),
         links={"self": f"/v1/scans/{scan.id}"},
     )

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from worker.contract import FINISHED, Priority, State
 from worker.ledger import Job
@@ -28,7 +28,23 @@ class FileIn(Body):
 
 class UploadIn(Body):
     name: Name
+    files: Annotated[list[FileIn], Field(max_length=50_000)]
+    growing: bool = Field(default=False, description="more files, scan.json too perhaps, are announced later")
+
+    @model_validator(mode="after")
+    def _has_files(self) -> UploadIn:
+        if not self.files and not self.growing:
+            raise ValueError("files: is empty, expected at least scan.json; an upload that is growing may begin so")
+        return self
+
+
+class FilesIn(Body):
     files: Annotated[list[FileIn], Field(min_length=1, max_length=50_000)]
+
+
+class ImportIn(Body):
+    folder: Annotated[str, Field(min_length=1, max_length=4096, description="the allowed folder's name, then / below")]
+    name: Name | None = Field(default=None, description="of the scan; default: that in scan.json")
 
 
 PriorityName = Literal["low", "normal", "high"]
@@ -79,6 +95,10 @@ class FileOut(BaseModel):
     sha256: str | None = Field(description="of the bytes received; null until complete")
 
 
+class FileList(BaseModel):
+    files: list[FileOut]
+
+
 class UploadOut(BaseModel):
     id: str
     name: str
@@ -94,6 +114,7 @@ class ScanOut(BaseModel):
     name: str
     bytes: int
     facts: dict[str, Any]
+    pinned: bool = Field(description="kept, however old it grows")
     created_at: datetime
     links: dict[str, str]
 
@@ -121,6 +142,7 @@ class JobOut(BaseModel):
     attempt: int
     priority: PriorityName
     restart_of: str | None = Field(description="the job that it was made from")
+    pinned: bool = Field(description="kept, however old it grows")
     options: dict[str, Any]
     created_at: datetime
     started_at: datetime | None
@@ -145,6 +167,7 @@ class JobOut(BaseModel):
             attempt=job.attempt,
             priority=priority_name(job),
             restart_of=job.restart_of,
+            pinned=job.pinned,
             options=job.options,
             created_at=moment(job.created_at),
             started_at=None if job.started_at is None else moment(job.started_at),

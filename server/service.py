@@ -11,9 +11,11 @@ from fastapi import Depends, Request
 
 from server.access import Caller
 from server.census import Outcomes
+from server.importing import Root
 from server.intake import Intake
 from server.problems import not_found
 from server.quotas import Quotas
+from server.reserve import Reserve
 from server.settings import Settings
 from server.store import Store
 from server.turns import Turns
@@ -30,7 +32,9 @@ class Service:
     watch: Watch
     outcomes: Outcomes
     quotas: Quotas
+    reserve: Reserve
     wake: Callable[[], None]  # have the reconcile loop look at once
+    imports: tuple[Root, ...] = ()  # folders that scans may be imported from
     turns: Turns = field(default_factory=Turns)
     caller: Caller | None = None  # None: the server itself
 

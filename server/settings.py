@@ -25,6 +25,8 @@ class Settings(WorkerSettings):
     check: str = "splatcore.check"  # for tests: the module that judges an uploaded scan
     check_memory_mib: int = 8192  # address space of that check; a hostile TIFF gets no further
     disk_floor_mib: int = 512  # kept free: no upload may take the last of the disk
+    disk_reserve_mib: int = Field(default=8, ge=0)  # held by a file, so that a full disk still lets things be deleted
+    import_from: str = ""  # folders of this machine that tenants may import scans from: TENANT=FOLDER, comma between
     tenant_gib: float = Field(default=0.0, ge=0)  # of uploads and scans that one tenant may keep; 0: no limit
     tenant_jobs: int = Field(default=0, ge=0)  # of one tenant that may wait and run together; 0: no limit
     rate_per_s: float = Field(default=50.0, ge=0)  # requests of one key, on the long run; 0: no limit
@@ -33,7 +35,11 @@ class Settings(WorkerSettings):
     webhook_allow: str = ""  # private networks that webhooks may lead to, such as 10.1.0.0/16, comma between
     webhook_retry_s: float = Field(default=5.0, gt=0)  # before the second attempt; later pauses grow with it
     session_hours: float = Field(default=12.0, gt=0)  # of the page; then it asks for the key again
-    stale_upload_hours: float = 48.0
+    # How many days after their last use things are kept, unless they are pinned; 0: for ever.
+    keep_results_days: float = Field(default=0.0, ge=0)  # jobs that succeeded, after their end
+    keep_failed_days: float = Field(default=0.0, ge=0)  # jobs that failed or were cancelled, after their end
+    keep_scans_days: float = Field(default=0.0, ge=0)  # scans without a job, after the last one was sent or deleted
+    stale_upload_hours: float = 48.0  # open uploads, after the last byte; their clients are gone
     reconcile_s: float = 2.0
     log_format: Literal["json", "text"] = "json"
 

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from server.submissions import Claim, Submissions
 from worker.contract import LOCAL_TENANT, Priority
 from worker.database import Database, metadata
-from worker.ledger import Ledger
+from worker.ledger import Job, Ledger
 
 uploads = sa.Table(
     "uploads",
@@ -35,7 +35,7 @@ files = sa.Table(
     sa.Column("position", sa.Integer, nullable=False),
     sa.Column("size", sa.BigInteger, nullable=False),
     sa.Column("expected_sha256", sa.String(64)),
-    sa.Column("sha256", sa.String(64)),  # of the bytes on disk; null until complete
+    sa.Column("sha256", sa.String(64), index=True),  # of the bytes on disk; null until complete
 )
 
 parts = sa.Table(
@@ -55,6 +55,8 @@ scans = sa.Table(
     sa.Column("facts", sa.JSON, nullable=False),
     sa.Column("created_at", sa.Float, nullable=False, index=True),
     sa.Column("tenant", sa.String(64), nullable=False, server_default=LOCAL_TENANT),
+    sa.Column("pinned", sa.Boolean, nullable=False, server_default=sa.false()),  # kept, however old it grows
+    sa.Column("used_at", sa.Float),  # when a job of it last came or went
     sa.Index("ix_scans_tenant_created_at", "tenant", "created_at"),
 )
 
@@ -101,6 +103,8 @@ class Scan:
     facts: dict[str, Any]
     created_at: float
     tenant: str
+    pinned: bool = False
+    used_at: float | None = None
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,13 @@ Permit = Callable[[sa.Connection], None]
 
 def _always(_write: sa.Connection) -> None:
     """For who has no quota."""
+
+
+def _file_rows(upload_id: str, announced: Sequence[File], first: int) -> list[dict[str, Any]]:
+    return [
+        {"upload_id": upload_id, "position": n, "name": f.name, "size": f.size, "expected_sha256": f.expected_sha256}
+        for n, f in enumerate(announced, first)
+    ]
 
 
 class Store:
@@ -144,21 +155,12 @@ class Store:
     def add_upload(self, name: str, announced: Sequence[File], permit: Permit = _always) -> Upload:
         """`permit` may refuse by raising; it sees what there is, and what comes after it cannot change that."""
         upload_id, now = str(uuid4()), time.time()
-        rows = [
-            {
-                "upload_id": upload_id,
-                "position": n,
-                "name": f.name,
-                "size": f.size,
-                "expected_sha256": f.expected_sha256,
-            }
-            for n, f in enumerate(announced)
-        ]
         with self.database.writing() as write:
             permit(write)
             row = {"id": upload_id, "name": name, "committed": False, "created_at": now, "touched_at": now}
             write.execute(uploads.insert().values(**row, tenant=self.tenant or LOCAL_TENANT))
-            write.execute(files.insert(), rows)
+            if announced:
+                write.execute(files.insert(), _file_rows(upload_id, announced, 0))
         return Upload(upload_id, name, False, now, tuple(announced))
 
     def upload(self, upload_id: str) -> Upload | None:
@@ -193,6 +195,31 @@ class Store:
             write.execute(parts.delete().where(parts.c.upload_id == upload_id, parts.c.name == name))
             write.execute(uploads.update().where(uploads.c.id == upload_id).values(touched_at=time.time()))
 
+    def received_all(self, upload_id: str, digests: dict[str, str]) -> None:
+        """Files that are complete without having been sent, by name."""
+        with self.database.writing() as write:
+            for name, sha256 in digests.items():
+                mine = sa.and_(files.c.upload_id == upload_id, files.c.name == name)
+                write.execute(files.update().where(mine).values(sha256=sha256))
+
+    def add_files(
+        self, upload_id: str, judge: Callable[[Sequence[File]], list[File]], permit: Callable[[int], Permit]
+    ) -> list[File] | None:
+        """Announce more files of an open upload; None if it is none. `judge` is shown the files that are there, and
+        says which are to be added, or refuses by raising, as `permit` for the bytes of these may."""
+        with self.database.writing() as write:
+            is_open = sa.and_(uploads.c.id == upload_id, self._mine(uploads), ~uploads.c.committed)
+            touched = uploads.update().where(is_open).values(touched_at=time.time())
+            if not write.execute(touched).rowcount:  # this row is ours until the end: others who add files wait
+                return None
+            columns = (files.c.name, files.c.size, files.c.expected_sha256, files.c.sha256)
+            there = [File(*row) for row in write.execute(sa.select(*columns).where(files.c.upload_id == upload_id))]
+            new = judge(there)
+            permit(sum(file.size for file in new))(write)
+            if new:
+                write.execute(files.insert(), _file_rows(upload_id, new, len(there)))
+        return new
+
     def acknowledge(self, upload_id: str, name: str, offset: int) -> None:
         """So many bytes of a file that arrives in pieces are durable."""
         mine = sa.and_(parts.c.upload_id == upload_id, parts.c.name == name)
@@ -209,11 +236,6 @@ class Store:
         )
         with self.database.reading() as read:
             return int(read.execute(query.where(~uploads.c.committed, files.c.sha256.is_(None))).scalar_one())
-
-    def stale_uploads(self, before: float) -> list[str]:
-        query = sa.select(uploads.c.id).where(~uploads.c.committed, uploads.c.touched_at < before)
-        with self.database.reading() as read:
-            return list(read.execute(query).scalars())
 
     def drop_upload(self, upload_id: str) -> bool:
         """Forget an open upload."""
@@ -246,6 +268,12 @@ class Store:
         with self.database.reading() as read:
             return [Scan(*row) for row in read.execute(query)]
 
+    def pin_scan(self, scan_id: str, pinned: bool) -> bool:
+        """Keep a scan from being cleaned away, or no longer; False if there is none."""
+        mine = sa.and_(scans.c.id == scan_id, self._mine(scans))
+        with self.database.writing() as write:
+            return write.execute(scans.update().where(mine).values(pinned=pinned)).rowcount == 1
+
     def drop_scan(self, scan_id: str) -> bool:
         """Forget a scan, and the upload it came from; False while a job needs it."""
         with self.database.writing() as write:
@@ -271,9 +299,16 @@ class Store:
             if write.execute(sa.select(scans.c.id).where(mine)).first() is None:
                 return False
             permit(write)
+            write.execute(scans.update().where(mine).values(used_at=time.time()))
             named = (scan.id, scan.name)
             self.jobs.add(write, job.id, job.name, named, job.options, job.priority, job.restart_of)
             if job.claim is not None:
                 self.submissions.add(write, job.claim, job.id)
             place()
             return True
+
+    def forget_job(self, job: Job) -> bool:
+        """Delete the row of a finished job. Its scan is unused from now on, not from whenever it was sent."""
+        with self.database.writing() as write:
+            write.execute(scans.update().where(scans.c.id == job.scan_id).values(used_at=time.time()))
+        return self.jobs.forget(job.id)

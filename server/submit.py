@@ -6,7 +6,7 @@ import hashlib
 import json
 from uuid import UUID, uuid4
 
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from server.problems import ApiProblem, invalid, not_found
 from server.schema import PRIORITIES, JobIn, RestartIn, priority_name
@@ -16,6 +16,7 @@ from server.submissions import Claim, Earlier, Kind
 from splatcore.errors import OptionsError, Problem
 from splatcore.options import Options
 from worker.contract import FINISHED
+from worker.fulldisk import is_full
 from worker.ledger import Job
 
 
@@ -77,14 +78,24 @@ def _submit(
 def _queue(service: Service, scan: Scan, job: NewJob) -> None:
     """The folder is made under a name of its own and gets the job's in the transaction that wins the id: of two
     requests at once, neither can spoil the folder of the other."""
-    made, folder = service.folder(f".new-{uuid4()}"), service.folder(job.id)
+    made, folder, placed = service.folder(f".new-{uuid4()}"), service.folder(job.id), False
+
+    def place() -> None:
+        nonlocal placed
+        made.become(folder)
+        placed = True
+
     try:
         made.create(service.intake.scan_folder(scan.id))
         if job.restart_of is not None:
             made.go_on_from(service.folder(job.restart_of))
-        queued = service.store.add_job(job, scan, lambda: made.become(folder), service.quotas.place_for(service.tenant))
+        queued = service.store.add_job(job, scan, place, service.quotas.place_for(service.tenant))
     except FileNotFoundError:
         queued = False
+    except DBAPIError as error:
+        if placed and is_full(error):  # the one error after which the row is surely not there
+            folder.remove()
+        raise
     finally:
         made.remove()  # nothing is there under that name once it has become the job's
     if not queued:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import shutil
 import threading
 from pathlib import Path as FolderPath
 from typing import Annotated
@@ -13,13 +11,14 @@ from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
 from starlette.requests import ClientDisconnect
 
-from server import names
+from server.adding import file_out
+from server.announce import announced, open_upload, require_scan_json
 from server.checking import CheckFailed, check_scan
 from server.intake import Arrival, Busy, Gone, Mismatch
 from server.partial import remove_part
 from server.problems import ApiProblem, invalid, not_found
 from server.scans import scan_out
-from server.schema import FileIn, FileOut, ScanOut, UploadIn, UploadOut, moment
+from server.schema import FileOut, ScanOut, UploadIn, UploadOut, moment
 from server.service import Served, Service
 from server.settings import MIB
 from server.store import File, Scan, Upload
@@ -36,21 +35,17 @@ FileName = Annotated[str, Path(max_length=1024)]
 
 @router.post("", status_code=201)
 def create_upload(body: UploadIn, service: Served, response: Response) -> UploadOut:
-    problems = _announcement_problems(body.files)
-    if problems:
-        raise invalid("The announced files cannot be accepted.", problems[:200])
-    announced = [File(f.name, f.size, f.sha256.lower() if f.sha256 else None, None) for f in body.files]
-    size = sum(file.size for file in announced)
-    _require_room(service, size)
-    upload = service.store.add_upload(body.name, announced, service.quotas.room_for(service.tenant, size))
-    service.intake.create(upload.id)
+    files = announced(body.files)
+    if not body.growing:
+        require_scan_json(files)
+    upload = open_upload(service, body.name, files)
     response.headers["Location"] = f"/v1/uploads/{upload.id}"
-    return _upload_out(upload)
+    return upload_out(upload)
 
 
 @router.get("/{upload_id}")
 def get_upload(upload_id: UUID, service: Served) -> UploadOut:
-    return _upload_out(_upload(service, upload_id))
+    return upload_out(_upload(service, upload_id))
 
 
 @router.put(
@@ -76,10 +71,6 @@ async def put_file(upload_id: UUID, name: FileName, request: Request, service: S
         raise not_found("upload") from None
     except Mismatch as mismatch:
         raise invalid(f"The file was refused: {mismatch}.", [Problem(name, str(mismatch), "send it again")]) from None
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        raise ApiProblem(507, "no-room", "The disk is full.") from None
     except ClientDisconnect:
         raise ApiProblem(400, "interrupted", "The connection ended before the file did.") from None
     return FileOut(name=name, size=file.size, received=file.size, complete=True, sha256=sha256)
@@ -91,12 +82,13 @@ def delete_upload(upload_id: UUID, service: Served) -> None:
         raise ApiProblem(409, "committed", "The upload is committed; delete the scan instead.")
     try:
         with service.intake.alone(str(upload_id), wait_s=2.0):
-            if service.store.drop_upload(str(upload_id)):
+            if service.reserve.deleting(lambda: service.store.drop_upload(str(upload_id))):
                 service.intake.remove_upload(str(upload_id))
     except Busy:
         raise ApiProblem(409, "busy", "Files of the upload are still arriving.", retry_after_s=2) from None
     except Gone:
-        service.store.drop_upload(str(upload_id))
+        service.reserve.deleting(lambda: service.store.drop_upload(str(upload_id)))
+    service.reserve.fill()
 
 
 @router.post("/{upload_id}/commit", status_code=201)
@@ -122,9 +114,11 @@ def _commit(service: Service, upload: Upload) -> Scan | None:
     if upload.committed:
         return None
     missing = upload.missing()
+    if all(file.name != "scan.json" for file in upload.files):
+        missing = ["scan.json", *missing]  # an upload that grew, and was never told of it
     if missing:
         problems = [Problem(name, "is missing", "send it, then commit again") for name in missing[:200]]
-        raise ApiProblem(409, "incomplete", f"{len(missing)} of {len(upload.files)} files are missing.", problems)
+        raise ApiProblem(409, "incomplete", f"{len(missing)} files are missing.", problems)
     if not _checks.acquire(timeout=COMMIT_WAIT_S):
         raise ApiProblem(503, "busy", "Other scans are being checked.", retry_after_s=5)
     try:
@@ -167,29 +161,6 @@ async def _receive(request: Request, service: Service, upload_id: str, file: Fil
         await to_thread.run_sync(arrival.discard, abandon_on_cancel=False)
 
 
-def _announcement_problems(files: list[FileIn]) -> list[Problem]:
-    problems, seen = [], set()
-    for position, file in enumerate(files):
-        where = f"files/{position}/name"
-        fault = names.fault(file.name)
-        if fault is not None:
-            problems.append(Problem(where, f"the name {fault}", "use plain names without folders"))
-        elif names.key(file.name) in seen:
-            problems.append(Problem(where, "the name is taken by another file of this upload"))
-        seen.add(names.key(file.name))
-    if all(file.name != "scan.json" for file in files):
-        problems.append(Problem("files", "scan.json is not among them", "it describes the scan; see docs/http.md"))
-    return problems
-
-
-def _require_room(service: Service, size: int) -> None:
-    """Refuse what will not fit, counting what open uploads still have to send."""
-    free = shutil.disk_usage(service.settings.data).free
-    spoken_for = service.store.outstanding_bytes() + service.settings.disk_floor_mib * MIB
-    if size > free - spoken_for:
-        raise ApiProblem(507, "no-room", f"The disk has no room for {size} more bytes. Delete jobs or scans first.")
-
-
 def _upload(service: Service, upload_id: UUID) -> Upload:
     upload = service.store.upload(str(upload_id))
     if upload is None:
@@ -197,19 +168,15 @@ def _upload(service: Service, upload_id: UUID) -> Upload:
     return upload
 
 
-def _upload_out(upload: Upload) -> UploadOut:
+def upload_out(upload: Upload) -> UploadOut:
     base = f"/v1/uploads/{upload.id}"
     links = {"self": base}
     links |= {"scan": f"/v1/scans/{upload.id}"} if upload.committed else {"commit": f"{base}/commit"}
-    files = [
-        FileOut(name=f.name, size=f.size, received=f.received, complete=bool(f.sha256), sha256=f.sha256)
-        for f in upload.files
-    ]
     return UploadOut(
         id=upload.id,
         name=upload.name,
         state="committed" if upload.committed else "open",
-        files=files,
+        files=[file_out(file) for file in upload.files],
         scan_id=upload.id if upload.committed else None,
         created_at=moment(upload.created_at),
         links=links,

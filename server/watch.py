@@ -161,4 +161,4 @@ def _shown(sight: Sight) -> object:
     job = sight.job
     if job is None:
         return None
-    return job.state, job.attempt, job.stage, job.message, job.progress, job.eta_s, sight.queue_position
+    return job.state, job.attempt, job.stage, job.message, job.progress, job.eta_s, job.pinned, sight.queue_position

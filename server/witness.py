@@ -22,9 +22,15 @@ log = logging.getLogger("splatct.audit")
 
 ACTIONS = {
     ("POST", "/v1/uploads"): "upload",
+    ("POST", "/v1/uploads/{upload_id}/files"): "upload",
+    ("POST", "/v1/imports"): "import",
     ("POST", "/v1/uploads/{upload_id}/commit"): "commit",
     ("DELETE", "/v1/uploads/{upload_id}"): "delete-upload",
     ("DELETE", "/v1/scans/{scan_id}"): "delete-scan",
+    ("POST", "/v1/scans/{scan_id}/pin"): "pin",
+    ("DELETE", "/v1/scans/{scan_id}/pin"): "unpin",
+    ("POST", "/v1/jobs/{job_id}/pin"): "pin",
+    ("DELETE", "/v1/jobs/{job_id}/pin"): "unpin",
     ("POST", "/v1/jobs"): "submit",
     ("PUT", "/v1/jobs/{job_id}"): "submit",
     ("POST", "/v1/jobs/{job_id}/restart"): "submit",

@@ -55,9 +55,9 @@ def main(arguments: list[str] | None = None) -> int:
         except Stopped:
             return Exit.STOPPED
         except Exception as error:
-            traceback.print_exc()
             code, message = _classify(error)
             say({"error": message})
+            _log(error)
             return code
 
 
@@ -99,6 +99,15 @@ def _part(engine: str, module: str, name: str) -> Callable[..., Any]:
     return part
 
 
+def _log(error: Exception) -> None:
+    """On a full disk there is no room for it: the error has been said, and must not become another."""
+    try:
+        traceback.print_exception(error)
+        sys.stderr.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # or what is left in its buffer fails again at exit
+
+
 def _classify(error: Exception) -> tuple[Exit, str]:
     """The exit code for an error, and the sentence about it that a user may read."""
     text = str(error)
@@ -109,10 +118,21 @@ def _classify(error: Exception) -> tuple[Exit, str]:
     # torch has its own class on the GPU and a plain RuntimeError on the CPU; neither is imported here
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "allocate memory" in text:
         return Exit.OUT_OF_MEMORY, "There is not enough memory for this scan. Try quality preview, or a smaller volume."
-    cause = error if isinstance(error, OSError) else error.__cause__  # the result writer wraps what it meets
-    if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
-        return Exit.DISK_FULL, "The disk filled up while the results were written. Make room and submit the job again."
+    if _is_full(error):
+        return Exit.DISK_FULL, (
+            "The disk filled up while the results were written. Make room and restart the job; it goes on from its "
+            "last state."
+        )
     return Exit.BUG, f"The engine failed unexpectedly ({type(error).__name__}). The log holds the details."
+
+
+def _is_full(error: BaseException | None) -> bool:
+    """As worker.fulldisk has it, without the database that this process does not know."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        error = error.__cause__  # the result writer wraps what it meets
+    return False
 
 
 def _private_stdout() -> TextIO:

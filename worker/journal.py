@@ -17,15 +17,23 @@ from typing import Any
 
 class EventWriter:
     def __init__(self, path: Path) -> None:
-        self._file = path.open("ab")
-        whole, self.last = _whole_lines(path)
-        os.truncate(self._file.fileno(), whole)  # a crash may have left half a line
+        self._file = path.open("ab", buffering=0)
+        self._whole, self.last = _whole_lines(path)
+        os.truncate(self._file.fileno(), self._whole)  # a crash may have left half a line
 
     def append(self, event: dict[str, Any]) -> None:
+        """Raises OSError, and then the journal is as it was."""
+        line = json.dumps({"number": self.last + 1, "at": time.time(), **event}, allow_nan=False)
+        whole = memoryview(line.encode() + b"\n")
+        written = 0
+        try:
+            while written < len(whole):
+                written += self._file.write(whole[written:])
+        except OSError:  # a full disk takes a part of a line
+            os.truncate(self._file.fileno(), self._whole)
+            raise
         self.last += 1
-        line = json.dumps({"number": self.last, "at": time.time(), **event}, allow_nan=False)
-        self._file.write(line.encode() + b"\n")
-        self._file.flush()
+        self._whole += written
 
     def __enter__(self) -> EventWriter:
         return self

@@ -46,6 +46,7 @@ jobs = sa.Table(
     sa.Column("priority", sa.Integer, nullable=False, server_default=sa.text("0")),  # worker.contract.Priority
     sa.Column("partial", sa.Boolean, nullable=False, server_default=sa.false()),  # it left a partial result
     sa.Column("restart_of", sa.String(36)),  # the job that it was made from
+    sa.Column("pinned", sa.Boolean, nullable=False, server_default=sa.false()),  # kept, however old it grows
     sa.Index("ix_jobs_tenant_created_at", "tenant", "created_at"),
     sa.Index("ix_jobs_tenant_started_at", "tenant", "started_at"),
 )
@@ -78,6 +79,7 @@ class Job:
     priority: int
     partial: bool
     restart_of: str | None
+    pinned: bool
 
 
 class Ledger:
@@ -253,6 +255,12 @@ class Ledger:
             if self._move(job_id, job.attempt, job.state, goal, message=text, eta_s=None):
                 break
         return self.get(job_id)
+
+    def pin(self, job_id: str, pinned: bool) -> bool:
+        """Keep a job from being cleaned away, or no longer; False if there is none."""
+        mine = sa.and_(jobs.c.id == job_id, self._mine())
+        with self._database.writing() as write:
+            return write.execute(jobs.update().where(mine).values(pinned=pinned)).rowcount == 1
 
     def forget(self, job_id: str) -> bool:
         """Delete the row of a finished job."""

@@ -20,6 +20,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from worker.contract import HEARTBEAT_S, ErrorKind, Exit, State
 from worker.database import Database
+from worker.fulldisk import is_full
 from worker.jobfolder import JobFolder
 from worker.journal import EventWriter
 from worker.ledger import Job, Ledger
@@ -47,6 +48,10 @@ _OUT_OF_MEMORY = (
     "The kernel ended the engine for want of memory. Try quality preview, fewer splats or a smaller volume, or a "
     "machine with more memory."
 )
+
+_WORDLESS: dict[int, str] = {
+    Exit.DISK_FULL: "The disk is full. Make room and restart the job; it goes on from its last state.",
+}
 
 
 class Lost(Exception):
@@ -133,6 +138,14 @@ class _Attempt:
         if self._folder.published():  # an earlier attempt got this far and died before saying so
             self._record_success()
             return
+        try:
+            self._work()
+        except OSError as error:
+            if not is_full(error) or self._folder.published():  # what is published the reconcile loop will record
+                raise
+            self._conclude(Exit.DISK_FULL)
+
+    def _work(self) -> None:
         job = self._job
         settings = self._settings
         spec = {
@@ -143,7 +156,8 @@ class _Attempt:
         self._folder.prepare(spec, job.attempt)
         with EventWriter(self._folder.events) as events:
             if job.attempt > 1:
-                events.append({"stage": "start", "fraction": 0.0, "message": f"Starting again: attempt {job.attempt}"})
+                again = {"stage": "start", "fraction": 0.0, "message": f"Starting again: attempt {job.attempt}"}
+                self._keep(again, events)
             engine = EngineProcess(self._folder, job.attempt, self._settings.engine, self._lock)
             try:
                 self._watch(engine, events)
@@ -182,7 +196,7 @@ class _Attempt:
             self._error = str(event["error"])
             return
         event = {**event, "attempt": self._job.attempt}
-        events.append(event)
+        self._keep(event, events)
         fraction = min(1.0, max(0.0, float(event.get("fraction", 0.0))))
         # The engine's own clock counts what earlier attempts have done of it.
         spent = float(event.get("seconds") or time.monotonic() - self._started)
@@ -192,6 +206,15 @@ class _Attempt:
             "progress": fraction,
             "eta_s": round(spent * (1 - fraction) / fraction, 1) if fraction > 0.01 else None,
         }
+
+    def _keep(self, event: dict[str, Any], events: EventWriter) -> None:
+        """A full disk costs the journal an event, not the run its work: there may be room again before its end."""
+        try:
+            events.append(event)
+        except OSError as error:
+            if not is_full(error):
+                raise
+            log.warning("job %s: the disk is full; an event is not kept", self._job.id)
 
     def _beat(self, now: float) -> None:
         self._beaten = now
@@ -224,6 +247,8 @@ class _Attempt:
         if code == Exit.OK:
             self._publish()
             return
+        if code == Exit.DISK_FULL:
+            self._folder.discard_attempts()  # at once: it may be the database that has no room to hear of it
         state = self._insist_on_state()
         if state is State.CANCELLING:
             self._record_cancel()
@@ -237,7 +262,7 @@ class _Attempt:
             ledger.hand_back(job.id, job.attempt)
             return
         elif code in _ERRORS:
-            message = self._error or "The engine failed. The log holds the details."
+            message = self._error or _WORDLESS.get(code, "The engine failed. The log holds the details.")
             ledger.fail(job.id, job.attempt, _ERRORS[Exit(code)], message)
         elif code == -signal.SIGKILL and not self._killed_by_us and self._memory.killed():
             ledger.fail(job.id, job.attempt, ErrorKind.OUT_OF_MEMORY, _OUT_OF_MEMORY)

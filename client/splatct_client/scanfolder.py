@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import unicodedata
 from collections.abc import Iterable, Iterator
@@ -25,12 +26,13 @@ class ScanFolder:
 
     @property
     def specs(self) -> list[FileSpec]:
-        sizes = {"scan.json": len(self.scan_json)} | {name: path.stat().st_size for name, path in self.files.items()}
-        return [FileSpec(name, size) for name, size in sizes.items()]
+        """With digests, for which all of the scan is read: what the server has already need not be sent."""
+        scan = FileSpec("scan.json", len(self.scan_json), hashlib.sha256(self.scan_json).hexdigest())
+        return [scan, *(_spec(name, path) for name, path in self.files.items())]
 
     @property
     def size(self) -> int:
-        return sum(spec.size for spec in self.specs)
+        return len(self.scan_json) + sum(path.stat().st_size for path in self.files.values())
 
     @property
     def sources(self) -> dict[str, Path | bytes]:
@@ -70,6 +72,12 @@ def read_scan_folder(folder: Path) -> ScanFolder:
         scan_json=json.dumps(scan, ensure_ascii=False, indent=1).encode(),
         files={sent: folder / name for name, sent in sent_as.items()},
     )
+
+
+def _spec(name: str, path: Path) -> FileSpec:
+    with path.open("rb") as stream:
+        sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+        return FileSpec(name, stream.tell(), sha256)
 
 
 def plain_names(names: Iterable[str]) -> dict[str, str]:

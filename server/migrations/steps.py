@@ -13,6 +13,8 @@ from server.migrations import (
     v0004_audit,
     v0005_webhooks,
     v0006_durable_jobs,
+    v0007_retention,
+    v0008_contents,
 )
 
 STEPS: tuple[Callable[[sa.Connection], None], ...] = (
@@ -22,4 +24,6 @@ STEPS: tuple[Callable[[sa.Connection], None], ...] = (
     v0004_audit.upgrade,
     v0005_webhooks.upgrade,
     v0006_durable_jobs.upgrade,
+    v0007_retention.upgrade,
+    v0008_contents.upgrade,
 )

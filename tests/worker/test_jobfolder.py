@@ -96,5 +96,30 @@ def test_events_are_numbered_across_writers_and_a_torn_line_is_dropped(tmp_path:
     assert all(json.loads(line) for line in path.read_text().splitlines())
 
 
+def test_a_full_disk_leaves_whole_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes a part of a line. The disk is pretended: tests/http/test_full_disk.py has a real one."""
+    path = tmp_path / "events.jsonl"
+    with EventWriter(path) as events:
+        events.append({"stage": "read"})
+        file = events._file
+
+        class Full:
+            fileno, room = file.fileno, 5
+
+            def write(self, data: memoryview) -> int:
+                if not self.room:
+                    raise OSError(28, "No space left on device")
+                taken, self.room = file.write(data[: self.room]), 0
+                return int(taken)
+
+        monkeypatch.setattr(events, "_file", Full())
+        with pytest.raises(OSError, match="No space left"):
+            events.append({"stage": "level"})
+        monkeypatch.undo()
+        assert path.read_bytes().endswith(b"\n")
+        events.append({"stage": "done"})
+    assert [(e["number"], e["stage"]) for e in read_events(path, 0, 10)] == [(1, "read"), (2, "done")]
+
+
 def test_no_events_yet(tmp_path: Path) -> None:
     assert read_events(tmp_path / "events.jsonl", 0, 10) == []

@@ -93,6 +93,43 @@ def test_errors_have_kinds_and_words(run: Run, new_job: NewJob, end: str, kind: 
     assert "secret detail" not in (job.error_message or "")
 
 
+def _fail_with(number: int) -> Callable[..., Any]:
+    def fail(*_: object) -> Any:
+        raise OSError(number, os.strerror(number))
+
+    return fail
+
+
+@pytest.mark.parametrize("step", ["prepare", "publish"])
+def test_a_disk_that_is_full_around_the_engine_is_told_as_such(
+    run: Run, new_job: NewJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    """Pretended here: tests/http/test_full_disk.py fills a real one."""
+    monkeypatch.setattr(JobFolder, step, _fail_with(28))
+    job = run(new_job())
+    assert (job.state, job.error_kind) == (State.FAILED, ErrorKind.DISK_FULL)
+    assert "Make room and restart" in (job.error_message or "")
+    assert not list(JobFolder(tmp_path, job.id).path.glob("attempt-*"))
+
+
+def test_another_error_around_the_engine_is_no_full_disk(
+    run: Run, new_job: NewJob, ledger: Ledger, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(JobFolder, "publish", _fail_with(5))
+    job = new_job()
+    with pytest.raises(OSError, match="Input/output error"):
+        run(job)
+    found = ledger.get(job.id)
+    assert found is not None and found.state is State.RUNNING, "the reconcile loop will judge"
+
+
+def test_events_that_do_not_fit_cost_the_run_nothing(
+    run: Run, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("worker.journal.EventWriter.append", _fail_with(28))
+    assert run(new_job(steps=4)).state is State.SUCCEEDED
+
+
 def test_a_killed_engine_is_tried_again_but_not_for_ever(run: Run, new_job: NewJob, tmp_path: Path) -> None:
     job = new_job(end="killed", steps=0)
     for attempt in range(2, MAX_CRASHES + 1):

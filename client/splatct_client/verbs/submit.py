@@ -100,7 +100,10 @@ def send(client: Client, scan: ScanFolder) -> str:
     """Upload and commit; returns the scan's id."""
     upload = client.create_upload(scan.name, scan.specs)
     try:
-        _send_files(client, upload.id, scan)
+        there = {file.name for file in upload.files if file.complete}
+        if there:
+            print(f"the server has {len(there)} of {len(scan.sources)} files already", file=sys.stderr)
+        _send_files(client, upload.id, scan, there)
         print("the server checks the files", file=sys.stderr)
         return client.commit(upload.id).id
     except (ServerProblem, KeyboardInterrupt):
@@ -109,16 +112,21 @@ def send(client: Client, scan: ScanFolder) -> str:
         raise
 
 
-def _send_files(client: Client, upload_id: str, scan: ScanFolder) -> None:
-    done, total = 0, scan.size
+def _send_files(client: Client, upload_id: str, scan: ScanFolder, there: set[str]) -> None:
+    missing = {name: source for name, source in scan.sources.items() if name not in there}
+    done, total = 0, sum(map(_size, missing.values()))
     with Bar("upload") as bar:
-        for name, source in scan.sources.items():
+        for name, source in missing.items():
 
             def show(sent: int, name: str = name, before: int = done) -> None:
                 at = before + sent
                 bar.show(at / max(total, 1), f"{size_text(at)} of {size_text(total)}  {name}")
 
             done += client.put_file(upload_id, name, source, show).size
+
+
+def _size(source: Path | bytes) -> int:
+    return len(source) if isinstance(source, bytes) else source.stat().st_size
 
 
 def watch(client: Client, job_id: str) -> Job:

@@ -29,7 +29,7 @@ def reconstruct(plan: dict[str, Any], options: Options, keeper: Keeper) -> Gener
         sum(itertools.repeat(1, 1 << 60))  # in C, and with the interpreter's lock
     try:
         for step in range(first, steps):
-            keeper.pause(lambda step=step: {"step": step})
+            keeper.pause(lambda step=step: {"step": step, "ballast": "x" * plan.get("state_bytes", 0)})
             time.sleep(plan.get("pause", 0.0))
             fraction = (step + 1) / (steps + 1)
             yield Progress("level", fraction, f"Step {step + 1} of {steps}", step=step, loss=1 / (step + 1))
@@ -48,4 +48,4 @@ def reconstruct(plan: dict[str, Any], options: Options, keeper: Keeper) -> Gener
         os.kill(os.getpid(), signal.SIGKILL)
     if end == "full":
         raise OSError(28, "No space left on device")
-    return {"options": options.to_dict(), "seed": options.seed}
+    return {"options": options.to_dict(), "seed": options.seed, "bytes": plan.get("result_bytes", 0)}

@@ -13,6 +13,7 @@ def write_results(reconstruction: dict[str, Any], folder: Path, overwrite: bool 
     (folder / "report.json").write_text(json.dumps({"findings": []}))
     (folder / "report.html").write_text("<h1>report</h1>")
     (folder / "poses.json").write_text(json.dumps({"format": "splatct-poses/1", "views": []}))
+    (folder / "splats.npz").write_bytes(bytes(reconstruction.pop("bytes", 0)))
     files = [
         {"name": f.name, "size": f.stat().st_size, "sha256": hashlib.sha256(f.read_bytes()).hexdigest()}
         for f in sorted(folder.iterdir())
