@@ -142,7 +142,11 @@ async def keep_delivering(outbox: Outbox, allowed: tuple[Network, ...]) -> None:
     """For ever. A slow receiver holds up the others of its round at most, and never a job."""
 
     async def one(due: Due) -> None:
-        outcome = await send(due, allowed)
+        try:
+            outcome = await send(due, allowed)
+        except Exception:  # counted as an attempt like any other, or it would come again for ever
+            log.exception("delivery %s could not be made", due.id)
+            outcome = Outcome(None, "it could not be sent; the server's log says more")
         await asyncio.to_thread(outbox.record, due, outcome)
 
     while True:

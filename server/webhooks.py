@@ -95,9 +95,11 @@ def _require_usable(text: str) -> None:
     """What can be said of a URL without asking anybody; where it leads is looked at when it is used."""
     try:
         url = httpx.URL(text)
-    except httpx.InvalidURL:
-        url = httpx.URL("")
-    if url.scheme not in ("http", "https") or not url.host or url.userinfo or url.fragment:
+        plain = url.scheme in ("http", "https") and url.host and "%" not in url.host and url.port != 0
+        usable = plain and not (url.userinfo or url.fragment) and (url.port or 1) < 65536
+    except (httpx.InvalidURL, UnicodeError):  # the second from a host that only looks like an encoded one
+        usable = False
+    if not usable:
         hint = "give an address such as https://lab.example.org/ct-done, without a user's name or a fragment"
         raise invalid("The address cannot be used.", [Problem("url", "is no plain http or https address", hint)])
 
