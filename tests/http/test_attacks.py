@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import re
 import socket
@@ -16,8 +17,11 @@ from server.audit import AuditLog, Wanted
 from server.deliveries import Due, Outcome, keep_delivering
 from server.keys import KeyRing
 from server.logs import Text
+from server.problems import ApiProblem
 from server.store import Store
+from server.watch import MOST_EYES, MOST_OF_ONE, Watch
 from worker.database import Database
+from worker.ledger import Ledger
 
 from .stack import Stack, commit, scan_files
 
@@ -111,6 +115,26 @@ def test_a_body_in_many_small_chunks_is_still_taken(keyed: Stack, scan_id: str) 
         headers={"Content-Type": "application/json"},
     )
     assert answer.status_code == 200, answer.text
+
+
+def test_one_tenant_cannot_take_all_places_of_those_who_wait(tmp_path: Path) -> None:
+    async def crowd() -> None:
+        database = Database(f"sqlite:///{tmp_path / 'empty.db'}")
+        watch = Watch(Ledger(database), tmp_path)
+        with contextlib.ExitStack() as stack:
+            for _ in range(MOST_OF_ONE):
+                stack.enter_context(watch.on("a job", "first"))
+            with pytest.raises(ApiProblem, match="of this tenant") as refused:
+                stack.enter_context(watch.on("another job", "first"))
+            assert refused.value.status == 503
+            for _ in range(MOST_EYES - MOST_OF_ONE):
+                stack.enter_context(watch.on("their job", "second"))
+            with pytest.raises(ApiProblem, match=f"{MOST_EYES} requests wait"):
+                stack.enter_context(watch.on("their job", "third"))
+        with watch.on("a job", "first"):
+            database.close()
+
+    asyncio.run(crowd())
 
 
 def test_plain_log_lines_stay_lines() -> None:
