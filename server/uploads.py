@@ -55,7 +55,12 @@ def get_upload(upload_id: UUID, service: Served) -> UploadOut:
 
 @router.put(
     "/{upload_id}/files/{name}",
-    openapi_extra={"requestBody": {"content": {"application/octet-stream": {}}, "required": True}},
+    openapi_extra={
+        "requestBody": {
+            "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+            "required": True,
+        }
+    },
 )
 async def put_file(upload_id: UUID, name: FileName, request: Request, service: Served) -> FileOut:
     found = await to_thread.run_sync(service.store.upload_file, str(upload_id), name)
