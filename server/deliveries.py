@@ -58,14 +58,16 @@ class Outbox:
         self._first_pause_s = first_pause_s
 
     def claim(self, most: int) -> list[Due]:
-        """Those that are due, ours for a while: several servers may look at once."""
+        """Those that are due, ours for a while: several servers may look at once. Turns go round among tenants, so
+        that one whose receivers are slow or dead holds up nobody else's."""
         now = time.time()
+        turn = sa.func.row_number().over(partition_by=webhooks.c.tenant, order_by=deliveries.c.due_at)
         query = (
             sa.select(deliveries.c.id, deliveries.c.due_at, deliveries.c.body, deliveries.c.attempts,
                       webhooks.c.url, webhooks.c.secret)
             .join(webhooks, webhooks.c.id == deliveries.c.webhook_id)
             .where(deliveries.c.due_at <= now)
-            .order_by(deliveries.c.due_at)
+            .order_by(turn, deliveries.c.due_at)
             .limit(most)
         )  # fmt: skip
         with self._database.reading() as read:

@@ -16,6 +16,8 @@ def configure(style: str) -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(Json() if style == "json" else Text())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+    for library in ("httpx", "httpcore"):  # they would write down webhooks' addresses, and those hold secrets
+        logging.getLogger(library).setLevel(logging.WARNING)
 
 
 def _fields(record: logging.LogRecord) -> dict[str, Any]:

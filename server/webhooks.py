@@ -14,6 +14,7 @@ from fastapi import APIRouter, Response
 
 from server.deliveries import SECRET_PREFIX
 from server.problems import ApiProblem, invalid, not_found
+from server.quotas import alone
 from server.schema import DeliveryList, DeliveryOut, WebhookIn, WebhookList, WebhookOut, moment
 from server.service import Served, Service
 from splatcore.errors import Problem
@@ -39,6 +40,7 @@ def add_webhook(body: WebhookIn, service: Served, response: Response) -> Webhook
     }
     count = sa.select(sa.func.count()).select_from(webhooks).where(webhooks.c.tenant == service.tenant)
     with service.store.database.writing() as write:
+        alone(write, service.tenant)
         if write.execute(count).scalar_one() >= MOST:
             faults = [Problem("webhooks", f"there are {MOST}, the most that a tenant may have", "delete one first")]
             raise ApiProblem(409, "too-many-webhooks", "The tenant has enough webhooks.", faults)
