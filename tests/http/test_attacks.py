@@ -23,7 +23,7 @@ from server.watch import MOST_EYES, MOST_OF_ONE, Watch
 from worker.database import Database
 from worker.ledger import Ledger
 
-from .stack import Stack, commit, scan_files
+from .stack import Stack, announce, commit, scan_files
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +115,26 @@ def test_a_body_in_many_small_chunks_is_still_taken(keyed: Stack, scan_id: str) 
         headers={"Content-Type": "application/json"},
     )
     assert answer.status_code == 200, answer.text
+
+
+def test_one_file_sent_many_times_at_once_takes_its_size_once(keyed: Stack) -> None:
+    """It was given room once; each sender would take as much again."""
+    size = 4 << 20
+    upload_id = announce(keyed.http, {"scan.json": b"x" * size})["id"]
+    parts = keyed.data / "uploads" / upload_id / "parts"
+    head = f"PUT /v1/uploads/{upload_id}/files/scan.json HTTP/1.1\r\nHost: localhost\r\n"
+    head += f"Authorization: {keyed.http.headers['Authorization']}\r\nContent-Length: {size}\r\n\r\n"
+    with contextlib.ExitStack() as stack:
+        senders = []
+        for _ in range(5):
+            senders.append(stack.enter_context(socket.create_connection(("127.0.0.1", keyed.port), timeout=20)))
+            senders[-1].sendall(head.encode() + b"y" * (size // 2))
+        answers = [sender.recv(100) for sender in senders[:-1]]
+        assert all(b" 409 " in answer for answer in answers), answers
+        keyed.until(lambda: len(list(parts.iterdir())) == 1, what="the newest alone is left")
+        senders[-1].sendall(b"y" * (size // 2))
+        assert b" 200 " in senders[-1].recv(100)
+    assert keyed.http.delete(f"/v1/uploads/{upload_id}").status_code == 204
 
 
 def test_one_tenant_cannot_take_all_places_of_those_who_wait(tmp_path: Path) -> None:
