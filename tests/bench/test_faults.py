@@ -22,9 +22,9 @@ def test_nothing_is_lost_published_twice_or_stuck(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_what_is_cut_is_committed_whole_and_hardly_sent_again(tmp_path: Path) -> None:
-    assert faults.main(["--quick", "--only", "uploads", "--seed", "3", "--out", str(tmp_path)]) == 0
+    assert faults.main(["--only", "uploads", "--uploads", "40", "--seed", "3", "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "faults.json").read_text())["uploads"]
-    assert (found["corrupt"], found["refused"], found["uploads"]) == ([], [], 100)
+    assert (found["corrupt"], found["refused"], found["uploads"]) == ([], [], 40)
     assert set(found["faults"]) == {"client", "server", "overlap", "repeat", "reorder"}
     assert 0 < found["most_chunks_sent_again"] < 1
     assert "**corrupt commits** | 0" in (tmp_path / "faults.md").read_text()
