@@ -13,6 +13,7 @@ import socket
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
+_UNICAST = ipaddress.IPv6Network("2000::/3")  # all else is special, whatever `is_global` makes of it
 _NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
 
 
@@ -46,6 +47,8 @@ def _fit(address: Address, allowed: tuple[Network, ...]) -> bool:
     address = _meant(address)
     if any(address in network for network in allowed):
         return True
+    if isinstance(address, ipaddress.IPv6Address) and address not in _UNICAST:
+        return False
     return address.is_global and not address.is_multicast
 
 

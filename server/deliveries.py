@@ -58,14 +58,16 @@ class Outbox:
         self._first_pause_s = first_pause_s
 
     def claim(self, most: int) -> list[Due]:
-        """Those that are due, ours for a while: several servers may look at once."""
+        """Those that are due, ours for a while: several servers may look at once. Turns go round among tenants, so
+        that one whose receivers are slow or dead holds up nobody else's."""
         now = time.time()
+        turn = sa.func.row_number().over(partition_by=webhooks.c.tenant, order_by=deliveries.c.due_at)
         query = (
             sa.select(deliveries.c.id, deliveries.c.due_at, deliveries.c.body, deliveries.c.attempts,
                       webhooks.c.url, webhooks.c.secret)
             .join(webhooks, webhooks.c.id == deliveries.c.webhook_id)
             .where(deliveries.c.due_at <= now)
-            .order_by(deliveries.c.due_at)
+            .order_by(turn, deliveries.c.due_at)
             .limit(most)
         )  # fmt: skip
         with self._database.reading() as read:
@@ -142,7 +144,11 @@ async def keep_delivering(outbox: Outbox, allowed: tuple[Network, ...]) -> None:
     """For ever. A slow receiver holds up the others of its round at most, and never a job."""
 
     async def one(due: Due) -> None:
-        outcome = await send(due, allowed)
+        try:
+            outcome = await send(due, allowed)
+        except Exception:  # counted as an attempt like any other, or it would come again for ever
+            log.exception("delivery %s could not be made", due.id)
+            outcome = Outcome(None, "it could not be sent; the server's log says more")
         await asyncio.to_thread(outbox.record, due, outcome)
 
     while True:

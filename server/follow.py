@@ -56,7 +56,7 @@ async def get_job(
 async def _following(job_id: UUID, service: Served) -> AsyncIterator[Eye]:
     """An eye on the job as long as the stream lasts; a 404 or 503 before it begins."""
     job = await run_in_threadpool(service.job, job_id)
-    with service.watch.on(job.id, events=True) as eye:
+    with service.watch.on(job.id, service.tenant, events=True) as eye:
         yield eye
 
 
@@ -80,7 +80,7 @@ async def _changed(request: Request, service: Service, out: JobOut, known: str, 
     """The job once it differs from `known`, or as it is when the time is over."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + wait_s
-    with service.watch.on(out.id) as eye:
+    with service.watch.on(out.id, service.tenant) as eye:
         while (left := deadline - loop.time()) > 0:
             sight = await eye.news(min(left, _STILL_THERE_S))
             if sight is None and not service.watch.closed and not await request.is_disconnected():

@@ -108,7 +108,7 @@ class KeyRing:
     def find(self, text: str) -> Key | None:
         """The valid key that reads so."""
         prefix, _, rest = text.partition("_")
-        if prefix != PREFIX or not text.isascii():
+        if prefix != PREFIX or not (text.isascii() and text.isprintable()):  # PostgreSQL fails on a NUL
             return None
         row = self._row(rest.partition("_")[0])
         known = "" if row is None else row.digest

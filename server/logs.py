@@ -16,6 +16,8 @@ def configure(style: str) -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(Json() if style == "json" else Text())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+    for library in ("httpx", "httpcore"):  # they would write down webhooks' addresses, and those hold secrets
+        logging.getLogger(library).setLevel(logging.WARNING)
 
 
 def _fields(record: logging.LogRecord) -> dict[str, Any]:
@@ -45,4 +47,9 @@ class Text(logging.Formatter):
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         fields = "".join(f" {name}={value}" for name, value in _fields(record).items() if value is not None)
-        return super().formatMessage(record) + fields
+        return _on_one_line(super().formatMessage(record) + fields)
+
+
+def _on_one_line(text: str) -> str:
+    """Without characters that would end the line, or move the cursor: a path or a name may hold any."""
+    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import unicodedata
 
-_DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))})
+_PORTS = (f"{port}{n}" for port in ("com", "lpt") for n in "0123456789¹²³")  # Windows takes these digits, too
+_DEVICES = frozenset({"con", "prn", "aux", "nul", "conin$", "conout$", *_PORTS})
 _LONGEST = 255  # bytes, the limit of common file systems
 
 

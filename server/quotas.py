@@ -36,7 +36,7 @@ class Quotas:
             if size > self.bytes:
                 what = f"the files have {size} bytes together, a tenant may keep {self.bytes}"
                 raise ApiProblem(413, "quota-too-small", "The scan is larger than the quota.", [_fault(what)])
-            _alone(write, tenant)
+            alone(write, tenant)
             used = used_bytes(write, tenant)
             if used + size > self.bytes:
                 what = f"{size} bytes are asked for; {used} of {self.bytes} are taken, {self.bytes - used} are free"
@@ -50,7 +50,7 @@ class Quotas:
         def permit(write: sa.Connection) -> None:
             if not self.active_jobs:
                 return
-            _alone(write, tenant)
+            alone(write, tenant)
             active = active_jobs(write, tenant)
             if active >= self.active_jobs:
                 fault = Problem(
@@ -74,8 +74,8 @@ def active_jobs(read: sa.Connection, tenant: str) -> int:
     return int(read.execute(query.where(jobs.c.tenant == tenant, jobs.c.state.in_(list(ACTIVE)))).scalar_one())
 
 
-def _alone(write: sa.Connection, tenant: str) -> None:
-    """SQLite has one writer as it is."""
+def alone(write: sa.Connection, tenant: str) -> None:
+    """For the rest of the transaction no other that asks for it has this tenant. SQLite has one writer as it is."""
     if write.dialect.name == "postgresql":
         write.execute(sa.select(sa.func.pg_advisory_xact_lock(_ADVISORY_LOCK, sa.func.hashtext(tenant))))
 

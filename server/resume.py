@@ -28,6 +28,7 @@ router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
 TUS = {"Tus-Resumable": "1.0.0"}
 MEDIA_TYPE = "application/offset+octet-stream"
+BYTES = {"type": "string", "format": "binary"}
 BUFFER = MIB
 ACKNOWLEDGE_EVERY = 16 * MIB  # a crash costs at most this much of a chunk, however long the chunk is
 
@@ -35,8 +36,17 @@ FileName = Annotated[str, Path(max_length=1024)]
 
 
 @router.options("", status_code=204)
-@router.options("/{upload_id}/files/{name}", status_code=204)
 async def options() -> Response:
+    return _offered()
+
+
+@router.options("/{upload_id}/files/{name}", status_code=204)
+async def options_of_file(upload_id: UUID, name: FileName) -> Response:
+    """The same of every file, whether it is there or not."""
+    return _offered()
+
+
+def _offered() -> Response:
     offered = {
         "Tus-Version": "1.0.0",
         "Tus-Extension": "checksum",
@@ -59,7 +69,7 @@ async def head_file(upload_id: UUID, name: FileName, request: Request, service: 
 @router.patch(
     "/{upload_id}/files/{name}",
     status_code=204,
-    openapi_extra={"requestBody": {"content": {MEDIA_TYPE: {}}, "required": True}},
+    openapi_extra={"requestBody": {"content": {MEDIA_TYPE: {"schema": BYTES}}, "required": True}},
 )
 async def patch_file(upload_id: UUID, name: FileName, request: Request, service: Served) -> Response:
     _require_version(request)

@@ -11,7 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from worker.contract import FINISHED, Priority, State
 from worker.ledger import Job
 
-Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
+# None that a terminal, a log or a page would obey: controls, line ends, turns of direction.
+_PLAIN = r"^[^\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]+$"
+Name = Annotated[str, Field(min_length=1, max_length=200, pattern=_PLAIN)]
 
 
 class Body(BaseModel):

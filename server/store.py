@@ -179,6 +179,8 @@ class Store:
 
     def upload_file(self, upload_id: str, name: str) -> tuple[bool, File] | None:
         """Whether the upload is committed, and one of its files."""
+        if "\0" in name:  # PostgreSQL fails on it
+            return None
         query = (
             sa.select(uploads.c.committed, *_FILE)
             .select_from(_FILES_AND_PARTS.join(uploads, uploads.c.id == files.c.upload_id))

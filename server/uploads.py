@@ -50,7 +50,12 @@ def get_upload(upload_id: UUID, service: Served) -> UploadOut:
 
 @router.put(
     "/{upload_id}/files/{name}",
-    openapi_extra={"requestBody": {"content": {"application/octet-stream": {}}, "required": True}},
+    openapi_extra={
+        "requestBody": {
+            "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+            "required": True,
+        }
+    },
 )
 async def put_file(upload_id: UUID, name: FileName, request: Request, service: Served) -> FileOut:
     found = await to_thread.run_sync(service.store.upload_file, str(upload_id), name)
@@ -138,27 +143,33 @@ def _commit(service: Service, upload: Upload) -> Scan | None:
 
 
 async def _receive(request: Request, service: Service, upload_id: str, file: File, parts: FolderPath) -> str:
-    """Stream the body to disk in a thread, hashing on the way; constant memory."""
-    arrival = await to_thread.run_sync(Arrival, parts, file.size, file.expected_sha256)
-    try:
-        pending = bytearray()
-        async for chunk in request.stream():
-            pending += chunk
-            if len(pending) >= BUFFER:
-                await to_thread.run_sync(arrival.write, bytes(pending))
-                pending.clear()
-        await to_thread.run_sync(arrival.write, bytes(pending))
-        sha256 = await to_thread.run_sync(arrival.complete)
+    """Stream the body to disk in a thread, hashing on the way; constant memory.
 
-        def record() -> None:
-            service.store.received(upload_id, file.name, sha256)
+    A newer request for the same file ends this one, as with pieces: many at once would each take the file's size of
+    the disk, of which it was given once."""
+    async with service.turns.take(upload_id, file.name) as turn:
+        arrival = await to_thread.run_sync(Arrival, parts, file.size, file.expected_sha256)
+        try:
+            pending = bytearray()
+            with turn.scope:
+                async for chunk in request.stream():
+                    pending += chunk
+                    if len(pending) >= BUFFER:
+                        await to_thread.run_sync(arrival.write, bytes(pending))
+                        pending.clear()
+            if turn.scope.cancelled_caught:
+                raise ApiProblem(409, "taken-over", "A newer request writes this file now.")
+            await to_thread.run_sync(arrival.write, bytes(pending))
+            sha256 = await to_thread.run_sync(arrival.complete)
 
-        async with service.turns.take(upload_id, file.name):  # the whole file replaces what came in pieces
+            def record() -> None:
+                service.store.received(upload_id, file.name, sha256)
+
             await to_thread.run_sync(service.intake.settle, upload_id, file.name, arrival, record)
-            await to_thread.run_sync(remove_part, parts, file.name)
-        return sha256
-    finally:
-        await to_thread.run_sync(arrival.discard, abandon_on_cancel=False)
+            await to_thread.run_sync(remove_part, parts, file.name)  # the whole file replaces what came in pieces
+            return sha256
+        finally:
+            await to_thread.run_sync(arrival.discard, abandon_on_cancel=False)
 
 
 def _upload(service: Service, upload_id: UUID) -> Upload:

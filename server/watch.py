@@ -22,6 +22,7 @@ log = logging.getLogger("splatct.server")
 
 EVERY_S = 0.5
 LEAST_S = 0.05  # between two looks, however many newcomers ask for one
+MOST_OF_ONE = 250  # of one tenant, so that others find a place
 MOST_EYES = 500  # each is an open connection, of which a process commonly may have 1,024
 
 
@@ -36,8 +37,9 @@ class Sight:
 class Eye:
     """One who waits for news of one job."""
 
-    def __init__(self, job_id: str, watched: _Watched) -> None:
+    def __init__(self, job_id: str, watched: _Watched, tenant: str) -> None:
         self.job_id = job_id
+        self.tenant = tenant
         self._watched = watched
         self._bell = asyncio.Event()
         if watched.sight is not None:
@@ -82,15 +84,20 @@ class Watch:
         self.closed = False
 
     @contextlib.contextmanager
-    def on(self, job_id: str, events: bool = False) -> Iterator[Eye]:
-        """Watch a job, with its events if asked. 503 when too many do already."""
-        if sum(len(watched.eyes) for watched in self._watched.values()) >= MOST_EYES:
-            raise ApiProblem(503, "busy", f"{MOST_EYES} requests wait for news already.", retry_after_s=15)
+    def on(self, job_id: str, tenant: str, events: bool = False) -> Iterator[Eye]:
+        """Watch a job, with its events if asked. 503 when too many do already, of all or of this tenant's."""
+        open_eyes = [eye.tenant for watched in self._watched.values() for eye in watched.eyes]
+        for count, most, whose in (
+            (len(open_eyes), MOST_EYES, ""),
+            (open_eyes.count(tenant), MOST_OF_ONE, " of this tenant"),
+        ):
+            if count >= most:
+                raise ApiProblem(503, "busy", f"{most} requests{whose} wait for news already.", retry_after_s=15)
         watched = self._watched.setdefault(job_id, _Watched())
         if events and watched.tail is None:
             watched.tail = Tail(JobFolder(self._data, job_id).events)
             watched.sight = None  # what was seen so far says nothing of the events: look at both together
-        eye = Eye(job_id, watched)
+        eye = Eye(job_id, watched, tenant)
         watched.eyes.add(eye)
         if watched.sight is None:
             self._newcomer.set()

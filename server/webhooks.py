@@ -14,6 +14,7 @@ from fastapi import APIRouter, Response
 
 from server.deliveries import SECRET_PREFIX
 from server.problems import ApiProblem, invalid, not_found
+from server.quotas import alone
 from server.schema import DeliveryList, DeliveryOut, WebhookIn, WebhookList, WebhookOut, moment
 from server.service import Served, Service
 from splatcore.errors import Problem
@@ -39,6 +40,7 @@ def add_webhook(body: WebhookIn, service: Served, response: Response) -> Webhook
     }
     count = sa.select(sa.func.count()).select_from(webhooks).where(webhooks.c.tenant == service.tenant)
     with service.store.database.writing() as write:
+        alone(write, service.tenant)
         if write.execute(count).scalar_one() >= MOST:
             faults = [Problem("webhooks", f"there are {MOST}, the most that a tenant may have", "delete one first")]
             raise ApiProblem(409, "too-many-webhooks", "The tenant has enough webhooks.", faults)
@@ -95,9 +97,11 @@ def _require_usable(text: str) -> None:
     """What can be said of a URL without asking anybody; where it leads is looked at when it is used."""
     try:
         url = httpx.URL(text)
-    except httpx.InvalidURL:
-        url = httpx.URL("")
-    if url.scheme not in ("http", "https") or not url.host or url.userinfo or url.fragment:
+        plain = url.scheme in ("http", "https") and url.host and "%" not in url.host and url.port != 0
+        usable = plain and not (url.userinfo or url.fragment) and (url.port or 1) < 65536
+    except (httpx.InvalidURL, UnicodeError):  # the second from a host that only looks like an encoded one
+        usable = False
+    if not usable:
         hint = "give an address such as https://lab.example.org/ct-done, without a user's name or a fragment"
         raise invalid("The address cannot be used.", [Problem("url", "is no plain http or https address", hint)])
 

@@ -17,18 +17,22 @@ _REFUSAL = (
 
 
 class BoundedHead(HttpToolsProtocol):
-    """Closes a connection on which more than `HEAD_BYTES` came without a head being whole."""
+    """Closes a connection on which more than `HEAD_BYTES` came without a head being whole, or in the trailers of a
+    body that came in chunks: headers again, which would be kept, too."""
 
-    _pending = 0
+    _pending = 0  # bytes of a head, or of what follows the last byte of a body
     _in_body = False
 
     def data_received(self, data: bytes) -> None:
-        if not self._in_body:
-            self._pending += len(data)
+        self._pending += len(data)
         super().data_received(data)
-        if not self._in_body and self._pending > HEAD_BYTES and not self.transport.is_closing():
+        if self._pending > HEAD_BYTES and not self.transport.is_closing():
             self.transport.write(_REFUSAL)
             self.transport.close()
+
+    def on_body(self, body: bytes) -> None:
+        super().on_body(body)
+        self._pending = 0
 
     def on_headers_complete(self) -> None:
         self._in_body, self._pending = True, 0

@@ -49,6 +49,7 @@ ACTIONS = {
     ("DELETE", "/v1/session"): "sign-out",
 }
 _READ_AGAIN_S = 60.0
+_ADDRESS = 64  # characters that are kept: a proxy may have passed on what its caller called himself
 _MOST_READS = 10_000
 
 
@@ -105,7 +106,7 @@ def _deed(scope: Scope, status: int, headers: Headers) -> Deed | None:
     return Deed(
         tenant="" if caller is None else caller.tenant,
         key_id=None if caller is None else caller.key_id,
-        address=scope["client"][0] if scope.get("client") else "",
+        address=scope["client"][0][:_ADDRESS] if scope.get("client") else "",
         action="sign-in-refused" if refused else action,
         thing=thing,
         detail=_part(path, str(given.get("file", ""))) if reading else "",

@@ -9,22 +9,33 @@ from __future__ import annotations
 import difflib
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from splatcore.errors import Problem
 
-MAX_BYTES = 64 * 2**20
+MAX_BYTES = 48 * 2**20  # frames of 100,000 views
+_MAX_NOT_ASCII = 8 * 2**20  # bytes; one rare character makes Python keep four bytes for each
+# What a text of many small values may cost in memory, told before it is parsed; twice what 100,000 views need.
+_MAX_MARKS = {"[": 1_000_000, "{": 250_000, ":": 500_000, ",": 2_500_000}
 _MAX_DEPTH = 64
 _MAX_PROBLEMS = 60
 _SHOWN = 60  # characters of an offending value that a message repeats
+_LONGEST_GUESSED = 255  # characters of a word whose likeness to others is looked for
 
 
 def shown(value: object) -> str:
     """A value as a message repeats it: JSON-like and short."""
+    if isinstance(value, str):
+        value = value[: _SHOWN + 1]  # it may be megabytes
+    text = ""
     try:
-        text = json.dumps(value)
+        for piece in json.JSONEncoder().iterencode(value):  # bit by bit: nobody reads the rest
+            text += piece
+            if len(text) > _SHOWN:
+                break
     except (TypeError, ValueError, RecursionError):
         text = repr(value)
     return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
@@ -32,7 +43,7 @@ def shown(value: object) -> str:
 
 def nearest(given: str, known: Iterable[str]) -> str:
     """A hint that names the closest known word, or all of them."""
-    known = list(known)
+    known, given = list(known), given[:_LONGEST_GUESSED]
     close = difflib.get_close_matches(given, known, n=1, cutoff=0.6)
     if close:
         return f"did you mean {close[0]!r}?"
@@ -44,6 +55,20 @@ def token(key: str) -> str:
     text = key if key.isprintable() else ascii(key)[1:-1]
     text = text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
     return text.replace("~", "~0").replace("/", "~1")
+
+
+def _items(container: Any) -> Iterator[tuple[Any, Any]]:
+    return iter(container.items() if isinstance(container, dict) else enumerate(container))
+
+
+def _plain(container: dict[str, Any] | list[Any]) -> bool:
+    """Whether it is a list of finite numbers: the long ones are, and need no step for each."""
+    if not isinstance(container, list) or not set(map(type, container)) <= {int, float}:
+        return False
+    try:
+        return all(map(math.isfinite, container))
+    except OverflowError:  # a whole number beyond all floats
+        return False
 
 
 class Document:
@@ -59,8 +84,19 @@ class Document:
         else:
             self._left_out += 1
 
+    @property
+    def full(self) -> bool:
+        """Whether more problems are only counted. What costs time to say is then not worth finding out."""
+        return len(self.problems) >= _MAX_PROBLEMS
+
+    def pass_over(self, count: int = 1) -> None:
+        """More problems of a kind that is noted already."""
+        self._left_out += count
+
     def all_problems(self) -> list[Problem]:
-        more = [Problem("", f"and {self._left_out} more problems", "mend these first")] if self._left_out else []
+        more = (
+            [Problem("", f"and at least {self._left_out} more problems", "mend these first")] if self._left_out else []
+        )
         return self.problems + more
 
     def load(self, path: Path) -> dict[str, Any] | None:
@@ -71,13 +107,26 @@ class Document:
             if size > MAX_BYTES:
                 self.note(name, f"is {size} bytes long, more than the {MAX_BYTES} allowed")
                 return None
-            text = path.read_bytes().decode("utf-8-sig")
+            raw = path.read_bytes()
+            if size > _MAX_NOT_ASCII and not raw.isascii():
+                what = f"is {size} bytes long and holds other characters than ASCII"
+                self.note(name, what, f"write them as \\u… or keep the file below {_MAX_NOT_ASCII} bytes")
+                return None
+            text = raw.decode("utf-8-sig")
+            del raw
         except UnicodeDecodeError as error:
             self.note(name, f"is not UTF-8 text (byte {error.start})", "save it as UTF-8")
             return None
         except OSError as error:
             self.note(name, f"cannot be read: {error.strerror}")
             return None
+        for mark, most in _MAX_MARKS.items():
+            count = text.count(mark)
+            if count > most:
+                self.note(
+                    name, f"holds {count} times {mark!r}, more than the {most} allowed", "leave out what is not used"
+                )
+                return None
         try:
             data = json.loads(text, object_pairs_hook=self._unique)
         except json.JSONDecodeError as error:
@@ -98,24 +147,33 @@ class Document:
     def _unique(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         result = dict(pairs)
         if len(result) < len(pairs):
-            names = [key for key, _ in pairs]
-            for key in sorted({key for key in names if names.count(key) > 1}):
+            counts = Counter(key for key, _ in pairs)
+            for key in sorted(key for key, count in counts.items() if count > 1):
                 self.note("scan.json", f"gives the key {shown(key)} twice in one object", "keep one of them")
         return result
 
     def _walk(self, data: Any, name: str) -> None:
         """Notes numbers that are not finite anywhere, and nesting that is too deep."""
-        stack: list[tuple[Any, str, int]] = [(data, "", 0)]
+        stack: list[Iterator[tuple[Any, Any]]] = [_items(data)]
+        path: list[str] = []  # the keys that lead to each of the stack's containers but the first
         while stack:
-            value, pointer, depth = stack.pop()
-            if isinstance(value, float) and not math.isfinite(value):
+            key, value = next(stack[-1], (None, None))
+            if key is None:
+                stack.pop()
+                if path:
+                    path.pop()
+            elif isinstance(value, float) and not math.isfinite(value):
+                if self.full:
+                    self.pass_over()
+                    return
+                pointer = "".join(f"/{token(step)}" for step in [*path, str(key)])
                 self.note(pointer, f"got {value}, expected a finite number", "JSON knows neither NaN nor Infinity")
-            elif isinstance(value, dict | list):
-                if depth > _MAX_DEPTH:
+            elif isinstance(value, dict | list) and not _plain(value):
+                if len(stack) > _MAX_DEPTH:
                     self.note(name, f"is nested deeper than {_MAX_DEPTH} levels")
-                    return None
-                items = value.items() if isinstance(value, dict) else enumerate(value)
-                stack += [(item, f"{pointer}/{token(str(key))}", depth + 1) for key, item in items]
+                    return
+                stack.append(_items(value))
+                path.append(str(key))
 
     def object(
         self, value: Any, pointer: str, required: Sequence[str], optional: Sequence[str] = ()
@@ -127,6 +185,9 @@ class Document:
         known = [*required, *optional]
         for key in value:
             if key not in known:
+                if self.full:
+                    self.pass_over()
+                    continue
                 unused = [word for word in known if word not in value]
                 self.note(f"{pointer}/{token(key)}", "unknown key", nearest(key, unused))
         for key in required:
@@ -182,8 +243,16 @@ class Document:
         items = self.array(value, pointer, length, order)
         if items is None:
             return None
-        read = [self.number(item, f"{pointer}/{i}", low, high) for i, item in enumerate(items)]
-        return None if None in read else [x for x in read if x is not None]
+        read: list[float] = []
+        for i, item in enumerate(items):
+            if type(item) in (int, float) and low <= item <= high:
+                read.append(float(item))
+            elif self.full:
+                self.pass_over()
+                break
+            else:
+                self.number(item, f"{pointer}/{i}", low, high)
+        return read if len(read) == len(items) else None
 
     def text(self, value: Any, pointer: str, longest: int = 255) -> str | None:
         """Non-empty text without control characters."""

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import math
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -67,8 +66,9 @@ class Options:
             whole = knob.name != "dssim"
             if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
                 raise OptionsError(f"{knob.name}: got {value!r}, expected a {'whole ' if whole else ''}number")
-            if not (math.isfinite(value) and low <= value <= high):
-                raise OptionsError(f"{knob.name}: got {value}, expected {low} to {high}")
+            if not low <= value <= high:  # false for nan
+                shown = f"{value}" if abs(value) < 1e15 else "a number far beyond"  # nobody reads thousands of digits
+                raise OptionsError(f"{knob.name}: got {shown}, expected {low} to {high}")
 
         if self.method == "splatct" and self.steps is not None:
             raise OptionsError(f"steps: got {self.steps} with method splatct, expected it with r2 or paper alone")

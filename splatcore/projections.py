@@ -22,6 +22,7 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 MAX_PIXELS = 2**35  # 128 GiB of float32
+_SMALL_BYTES, _MOST_GAIN = 2**24, 200  # pixels that take much more room than they came in are a trap
 _ABSURD = 1e12  # no count and no line integral is as large
 _SMALLEST_FLOAT_TRANSMISSION = 2.0**-16  # of pixels stored as floats: below one count of a 16-bit detector
 _MOST_DARK_FLAT = 0.05  # share of pixels whose flat may fail to exceed the dark
@@ -49,7 +50,7 @@ def read_stacks(header: ScanHeader, doc: Document) -> Stacks | None:
     def read(files: tuple[NamedFile, ...]) -> tuple[TiffHeader, ...]:
         found = []
         for file in files:
-            stack, problems = read_header(file.path, file.name)
+            stack, problems = read_header(file.path, file.name, len(header.frames))
             for problem in problems:
                 doc.note(problem.where, problem.what, problem.hint)
             if stack is not None:
@@ -80,6 +81,11 @@ def read_stacks(header: ScanHeader, doc: Document) -> Stacks | None:
     masks = read((header.bad_pixels,)) if header.bad_pixels else ()
     if masks and masks[0].pages != 1:
         doc.note(masks[0].name, f"has {masks[0].pages} pages, expected one", "the mask holds for all views")
+    stacks = [*images, *flat, *dark, *masks]
+    claimed, stored = sum(stack.claimed for stack in stacks), sum(stack.bytes for stack in stacks)
+    if claimed > max(_SMALL_BYTES, _MOST_GAIN * stored):
+        what = f"hold {stored} bytes that claim to be {claimed} bytes of pixels"
+        doc.note("/projections/files", what, f"no image of a scanner packs more than {_MOST_GAIN} to 1")
     if len(doc.problems) > before or not images:
         return None
     return Stacks(images, flat, dark, masks[0] if masks else None)

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from splatcore.document import Document, nearest, shown
 from splatcore.tiff import MAX_PAGES
+
+_LONGEST_NAME = 1024  # characters, folders included
+_LOOKED_AT = 200  # files of a folder, for one whose name is near
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,9 @@ def find_file(folder: Path, name: object, pointer: str, doc: Document) -> NamedF
     if not isinstance(name, str) or not name:
         doc.note(pointer, f"got {shown(name)}, expected a file name")
         return None
+    if len(name) > _LONGEST_NAME:
+        doc.note(pointer, f"{shown(name)} has {len(name)} characters, more than the {_LONGEST_NAME} allowed")
+        return None
     path = PurePosixPath(name)
     if not name.isprintable() or "\\" in name or ":" in name or path.is_absolute() or ".." in path.parts:
         hint = "name a file inside the scan folder, with '/' between folders and no '..'"
@@ -34,13 +41,17 @@ def find_file(folder: Path, name: object, pointer: str, doc: Document) -> NamedF
         target = (root / path).resolve()
         inside, exists, regular = target.is_relative_to(root), target.exists(), target.is_file()
     except (OSError, RuntimeError) as error:  # a loop of links, a name too long
-        doc.note(pointer, f"{shown(name)} cannot be followed: {error}")
+        doc.note(
+            pointer,
+            f"{shown(name)} cannot be followed: {getattr(error, 'strerror', None) or 'its links run in a circle'}",
+        )
         return None
     if not inside:
         doc.note(pointer, f"{shown(name)} leads out of the scan folder", "links may only point inside it")
     elif not exists:
         try:
-            present = sorted(entry.name for entry in (root / path).parent.iterdir() if entry.is_file())[:1000]
+            entries = islice((root / path).parent.iterdir(), _LOOKED_AT)
+            present = sorted(entry.name for entry in entries if entry.is_file())
         except OSError:
             present = []
         hint = nearest(path.name, [entry for entry in present if entry != "scan.json"])
@@ -63,6 +74,9 @@ def find_files(given: Any, pointer: str, folder: Path, taken: dict[Path, str], d
         return ()
     found = []
     for i, name in enumerate(names):
+        if doc.full:  # following one name more may cost as much as its author likes
+            doc.pass_over()
+            break
         file = find_file(folder, name, f"{pointer}/{i}", doc)
         if file is None:
             continue

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import math
 import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,16 @@ MAX_SIDE = 32_768
 _UNCOMPRESSED, _DEFLATE = 1, (8, 32946)
 _DEFLATE_GAIN = 1100  # zlib packs at most 1032 to 1
 _PROBLEMS_PER_FILE = 5
+_MOST_VALUES = 2**20  # items of one list in a directory: where strips or tiles lie, and how long they are
+_SHARED_TAG = 1024  # bytes of a tag's values; smaller ones may be written once for many pages
+_TYPE_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8], np.uint64)  # by TIFF's type number
+_PAGES_LOOKED_AT = 1000  # of a file that has more pages than it may have
+_INFLATE_AT_ONCE = 2**20  # bytes
+
+# No flavour of TIFF is looked for: finding one out reads what it says of itself, and may follow it elsewhere.
+_NO_FLAVOUR: Any = {f"is_{flavour}": False for flavour in tifffile.TIFF.FILE_FLAGS}
+
+_OWN_PIXELS = "pages may not share their pixels; save each with its own"
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it would print, we raise
 
@@ -42,21 +53,33 @@ class TiffHeader:
     dtype: str
     bytes: int  # size of the file
 
+    @property
+    def claimed(self) -> int:
+        """Bytes of its pixels once they are decoded."""
+        return self.pages * math.prod(self.shape) * np.dtype(self.dtype).itemsize
+
 
 def _open(stream: BinaryIO) -> tifffile.TiffFile:
-    return tifffile.TiffFile(stream, is_ome=False, is_mmstack=False, is_ndtiff=False, _multifile=False)
+    return tifffile.TiffFile(stream, _multifile=False, **_NO_FLAVOUR)
 
 
-def read_header(path: Path, name: str) -> tuple[TiffHeader | None, list[Problem]]:
-    """The header of a stack, and everything wrong with it. None where it cannot be used at all."""
+def read_header(path: Path, name: str, most_pages: int = MAX_PAGES) -> tuple[TiffHeader | None, list[Problem]]:
+    """The header of a stack, and everything wrong with it. None where it cannot be used at all.
+
+    One of far more than `most_pages` is refused before its pages are looked at."""
     try:
         with path.open("rb") as stream:
             size = path.stat().st_size
-            offsets, broken = _page_offsets(stream, size)
+            allowed = max(most_pages, _PAGES_LOOKED_AT)
+            offsets, broken = _page_offsets(stream, size, allowed)
             if not offsets:
                 return None, [Problem(name, broken or "holds no image")]
+            if len(offsets) > allowed:
+                what = f"has more than {allowed} pages, expected at most {most_pages}"
+                return None, [Problem(name, what, "one page for each view; leave out all others")]
             problems = [Problem(name, broken, "the file is cut short or damaged; copy it again")] if broken else []
             shapes: list[tuple[tuple[int, int], str]] = []
+            stored = 0
             stream.seek(0)
             with _open(stream) as file:
                 for number in range(len(offsets)):
@@ -66,7 +89,12 @@ def read_header(path: Path, name: str) -> tuple[TiffHeader | None, list[Problem]
                         if len(problems) >= _PROBLEMS_PER_FILE:
                             break
                     else:
-                        shapes.append(page)
+                        shapes.append(page[:2])
+                        stored += page[2]
+                        if stored > size:
+                            what = f"the pages up to this one store {stored} bytes of pixels, the file has {size}"
+                            problems.append(Problem(f"{name}, page {number + 1} of {len(offsets)}", what, _OWN_PIXELS))
+                            break
     except OSError as error:
         return None, [Problem(name, f"cannot be read: {error.strerror or error}")]
     except Exception as error:  # a parser fed by strangers may raise anything
@@ -89,7 +117,10 @@ def read_pages(header: TiffHeader) -> Iterator[NDArray[Any]]:
     with header.path.open("rb") as stream, _open(stream) as file:
         for number in range(header.pages):
             try:
-                pixels = np.asarray(file.pages[number].asarray())
+                page: Any = file.pages[number]
+                if int(page.compression) in _DEFLATE:
+                    _require_bounded(page, stream)
+                pixels = np.asarray(page.asarray(maxworkers=1))
             except Exception as error:
                 where = f"{header.name}, page {number + 1} of {header.pages}"
                 raise ScanError([Problem(where, f"cannot be decoded: {error}", "copy the file again")]) from error
@@ -107,8 +138,10 @@ def read_stack(path: Path, name: str | None = None) -> NDArray[np.float32]:
     return stack
 
 
-def _page_offsets(stream: BinaryIO, size: int) -> tuple[list[int], str]:
-    """File offsets of the page directories, and what broke the chain of them (empty if nothing did)."""
+def _page_offsets(stream: BinaryIO, size: int, most: int) -> tuple[list[int], str]:
+    """File offsets of the page directories, and what broke the chain of them (empty if nothing did).
+
+    If there are more than `most`, one more than that many is enough to know."""
     head = stream.read(16)
     order = {b"II": "<", b"MM": ">"}.get(head[:2])
     magic = struct.unpack(order + "H", head[2:4])[0] if order and len(head) >= 8 else 0
@@ -121,31 +154,69 @@ def _page_offsets(stream: BinaryIO, size: int) -> tuple[list[int], str]:
     offset = struct.unpack(next_form, head[4:8] if magic == 42 else head[8:16])[0]
     offsets: list[int] = []
     seen: set[int] = set()
+    tag_bytes = listed_bytes = 0
     while offset:
         page = f"page {len(offsets) + 1}"
         if offset >= size:
             return offsets, f"is cut short: the header of {page} lies at byte {offset}, the file ends at byte {size}"
         if offset in seen:
             return offsets, f"its page directories run in a circle after page {len(offsets)}"
-        if len(offsets) >= MAX_PAGES:
-            return offsets, f"has more than {MAX_PAGES} pages"
+        if len(offsets) > most:
+            return offsets, ""
         stream.seek(offset)
         raw = stream.read(struct.calcsize(count_form))
         tags = struct.unpack(count_form, raw)[0] if len(raw) == struct.calcsize(count_form) else 0
-        stream.seek(offset + len(raw) + tags * entry if tags < 4096 else size)
-        following = stream.read(struct.calcsize(next_form))
+        listed = stream.read(tags * entry) if tags < 4096 else b""
+        following = stream.read(struct.calcsize(next_form)) if len(listed) == tags * entry else b""
         if len(following) < struct.calcsize(next_form):
             return offsets, f"is cut short: the header of {page} lies at byte {offset}, the file ends at byte {size}"
+        listed_bytes += len(listed)
+        if listed_bytes > size:
+            return [], f"its page directories up to {page} lie on top of each other"
+        longest, large = _tag_values(listed, order, entry)
+        tag_bytes += large
+        if longest > _MOST_VALUES:
+            return [], f"a list in the directory of {page} has {longest} items, more than the {_MOST_VALUES} allowed"
+        if tag_bytes > size:
+            return [], f"its page directories up to {page} claim {tag_bytes} bytes of values, the file has {size}"
         seen.add(offset)
         offsets.append(offset)
         offset = struct.unpack(next_form, following)[0]
     return offsets, ""
 
 
+def _tag_values(listed: bytes, order: str, entry: int) -> tuple[int, int]:
+    """(items of the longest list of numbers, bytes of all large values) that a directory's entries point to.
+
+    A file that holds each large value once has room for all of them; one that lets its pages share them would have
+    them read again and again."""
+    wide = {12: "u4", 20: "u8"}[entry]
+    fields = [("tag", order + "u2"), ("type", order + "u2"), ("count", order + wide), ("value", order + wide)]
+    tags = np.frombuffer(listed, np.dtype(fields))
+    each = _TYPE_BYTES[np.minimum(tags["type"], len(_TYPE_BYTES) - 1)]
+    sizes = tags["count"].astype(np.float64) * each  # a float cannot overflow
+    longest = tags["count"][each > 1].max(initial=0)
+    return int(longest), int(sizes[sizes > _SHARED_TAG].sum())
+
+
+def _require_bounded(page: Any, stream: BinaryIO) -> None:
+    """Raises ValueError where a compressed piece holds more than its share of the pixels. The decoder would make
+    room for it all, thousands of times what is stored."""
+    most = math.prod(page.chunks) * page.dtype.itemsize
+    for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
+        stream.seek(start)
+        inflate, left, total = zlib.decompressobj(), stream.read(length), 0
+        while left and not inflate.eof:
+            total += len(inflate.decompress(left, _INFLATE_AT_ONCE))
+            left = inflate.unconsumed_tail
+            if total > most:
+                raise ValueError(f"its data inflate to more than the {most} bytes of their pixels")
+
+
 def _read_page(
     file: tifffile.TiffFile, number: int, size: int
-) -> tuple[tuple[tuple[int, int], str] | None, tuple[str, str]]:
-    """((rows, cols), dtype) of one page, or what is wrong with it and a hint."""
+) -> tuple[tuple[tuple[int, int], str, int] | None, tuple[str, str]]:
+    """((rows, cols), dtype, bytes stored) of one page, or what is wrong with it and a hint."""
     try:
         page: Any = file.pages[number]
         shape, dtype = tuple(int(n) for n in page.shape), page.dtype
@@ -179,4 +250,4 @@ def _read_page(
         return None, (f"claims {claimed} bytes of pixels and stores {stored}", "the file is damaged")
     if claimed > stored * _DEFLATE_GAIN or max(lengths) > 1.1 * segment_bytes + 4096:
         return None, (f"claims {claimed} bytes of pixels out of {stored} stored ones", "the file is damaged")
-    return (shape, kind), ("", "")
+    return (shape, kind, stored), ("", "")

@@ -1,22 +1,26 @@
 """Kill everything, again and again, and count what was lost.
 
     python -m bench.faults            100 SIGKILLs of worker or engine, 20 of server and Redis, 10 wipes, 10 drains
+                                      and 1,000 uploads cut at random
     python -m bench.faults --quick    a tenth of it
 
 Real parts on loopback, in a temporary folder. Writes faults.md and faults.json; exits 1 if a job was lost, published
-twice or stuck.
+twice or stuck, or if an upload was committed as something else than what was sent, or sent again by a chunk or more.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from bench.faults.campaign import Campaign, Counts, Outcome
 from bench.faults.service import CHECKPOINT_S, Service
+from bench.faults.uploads import run_uploads
 
 _FULL = Counts(kills=100, server=20, redis=20, wipes=10, drains=10)
 _QUICK = Counts(kills=10, server=2, redis=2, wipes=1, drains=1)
@@ -27,22 +31,43 @@ def main(argv: list[str] | None = None) -> int:
         "python -m bench.faults", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--quick", action="store_true", help="a tenth of it")
+    parser.add_argument("--only", choices=("jobs", "uploads"), help="half of it")
+    parser.add_argument("--uploads", type=int, help="how many are cut (default 1000, or 100)")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("bench-results"), help="folder for faults.md and faults.json")
     args = parser.parse_args(argv)
-    began = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="splatct-faults-", ignore_cleanup_errors=True) as folder:
-        with Service(Path(folder), args.workers) as service:
-            outcome = Campaign(service, _QUICK if args.quick else _FULL, args.seed, print).run()
-    took = time.monotonic() - began
+    uploads = args.uploads or (100 if args.quick else 1000)
+    found: dict[str, object] = {"seed": args.seed}
+    page, good = "", True
     args.out.mkdir(parents=True, exist_ok=True)
-    found = {**outcome.to_json(), "seed": args.seed, "workers": args.workers, "minutes": round(took / 60, 1)}
+    if args.only != "jobs":
+        began = time.monotonic()
+        with _service(workers=0) as service:
+            cut = run_uploads(service, uploads, args.seed, print)
+        minutes = (time.monotonic() - began) / 60
+        found["uploads"] = {**cut.to_json(), "minutes": round(minutes, 1)}
+        page += f"Uploads cut at random, seed {args.seed}, {minutes:.0f} minutes.\n\n| | |\n|---|---:|\n{cut.table()}\n"
+        good = good and cut.good()
+    if args.only != "uploads":
+        began = time.monotonic()
+        with _service(args.workers) as service:
+            outcome = Campaign(service, _QUICK if args.quick else _FULL, args.seed, print).run()
+        took = time.monotonic() - began
+        found |= {**outcome.to_json(), "workers": args.workers, "minutes": round(took / 60, 1)}
+        page += report(outcome, args.seed, args.workers, took)
+        good = good and outcome.good()
     (args.out / "faults.json").write_text(json.dumps(found, indent=1) + "\n")
-    page = report(outcome, args.seed, args.workers, took)
     (args.out / "faults.md").write_text(page)
     print(page)
-    return 0 if outcome.good() else 1
+    return 0 if good else 1
+
+
+@contextlib.contextmanager
+def _service(workers: int) -> Iterator[Service]:
+    with tempfile.TemporaryDirectory(prefix="splatct-faults-", ignore_cleanup_errors=True) as folder:
+        with Service(Path(folder), workers) as service:
+            yield service
 
 
 def report(out: Outcome, seed: int, workers: int, seconds: float) -> str:

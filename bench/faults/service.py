@@ -41,6 +41,10 @@ class Part:
     def pid(self) -> int | None:
         return None if self._process is None else self._process.pid
 
+    def has_died(self) -> bool:
+        """And was not started again yet."""
+        return self._process is None or self._process.poll() is not None
+
     def tend(self) -> None:
         if self._process is not None and self._process.poll() is not None:
             self._process, self._died_at = None, time.monotonic()
@@ -81,7 +85,8 @@ class Service:
         }
         self.server = Part("server", environment, self.log)
         self.workers = [Part("worker", environment, self.log) for _ in range(workers)]
-        self._client = Client(f"http://127.0.0.1:{self._port}")
+        self.url = f"http://127.0.0.1:{self._port}"
+        self._client = Client(self.url)
         self._scan = ""
 
     def __enter__(self) -> Self:

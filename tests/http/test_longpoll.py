@@ -11,7 +11,7 @@ import httpx
 import pytest
 from splatct_client.client import Client
 
-from server.watch import MOST_EYES
+from server.watch import MOST_OF_ONE
 
 from .stack import Stack, commit, scan_files, submit
 
@@ -106,7 +106,7 @@ def test_more_than_the_server_can_hold_are_told_to_come_back(stack: Stack) -> No
         one_more()  # an earlier look may have taken the place of one of them
         return stack.http.get(f"{url}?wait=0.1").status_code == 503
 
-    for _ in range(MOST_EYES):
+    for _ in range(MOST_OF_ONE):
         one_more()
     stack.until(full, what="all places are taken")
     for more in (f"{url}?wait=5", f"{url}/events/stream"):

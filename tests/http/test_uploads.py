@@ -119,6 +119,8 @@ def test_a_bad_file_can_be_sent_again(http: httpx.Client) -> None:
         ("e\u0301.tif", "normal form"),
         ("NUL.tif", "device"),
         ("com1", "device"),
+        ("COM¹.tif", "device"),
+        ("CONIN$", "device"),
         (".lock", "dot"),
         ("a.tif.", "dot"),
         ("é" * 128, "255 bytes"),

@@ -108,6 +108,8 @@ def test_the_end_of_a_job_is_told_signed_and_on_record(told: Stack, receiver: Re
     told.until(lambda: log_of(told, hook)[0]["state"] == "delivered", what="the log says so")
     (entry,) = log_of(told, hook)
     assert (entry["id"], entry["attempts"], entry["status"]) == (headers["webhook-id"], 1, 200)
+    log = (told.data.parent / "log.txt").read_text()
+    assert "lab=1" not in log and hook["secret"] not in log, "what an address holds may be a secret"
 
 
 def test_only_what_was_asked_for_is_told(told: Stack, receiver: Receiver) -> None:
@@ -252,6 +254,17 @@ def test_a_delivery_is_one_server_s_at_a_time_and_given_up_in_the_end(store: Sto
     purge_deliveries(store.database)
     with store.database.reading() as read:
         assert read.execute(sa.select(deliveries.c.id)).first() is None
+
+
+def test_turns_go_round_among_tenants(store: Store) -> None:
+    hook(store, "a")
+    hook(store, "b")
+    with store.database.writing() as write:
+        for number in range(20):
+            announce(write, "a", "job.failed", {"id": f"a{number}"})
+        announce(write, "b", "job.failed", {"id": "b"})
+    claimed = [json.loads(due.body)["data"]["id"] for due in Outbox(store.database, 1.0).claim(8)]
+    assert "b" in claimed and len(claimed) == 8
 
 
 def test_a_receiver_that_is_gone_is_not_asked_again(store: Store) -> None:
