@@ -29,7 +29,8 @@ def test_a_scan_becomes_results(shared: Stack, finished: str) -> None:
     assert job["options"]["quality"] == "preview"
     assert job["created_at"] <= job["started_at"] <= job["finished_at"]
     manifest = shared.http.get(job["links"]["results"]).json()
-    assert {f["name"] for f in manifest["files"]} == {"volume.tif", "poses.json", "report.json", "report.html"}
+    names = {"volume.tif", "poses.json", "report.json", "report.html", "splats.npz"}
+    assert {f["name"] for f in manifest["files"]} == names
     for file in manifest["files"]:
         content = shared.http.get(f"/v1/jobs/{finished}/results/{file['name']}").content
         assert hashlib.sha256(content).hexdigest() == file["sha256"]
