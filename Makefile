@@ -29,7 +29,7 @@ serve: build  ## the whole service on this machine, http://127.0.0.1:8080
 	@$(BIN)/splatct up
 
 test: build  ## the tests that need no root and no system packages
-	@$(BIN)/python -m pytest -q
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 test-all: build  ## every test but those that need RTK, slow and system ones too; a skip is a failure
 	@SPLATCT_NO_SKIPS=1 $(BIN)/python -m pytest -q -m "not rtk"

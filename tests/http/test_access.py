@@ -21,6 +21,8 @@ from worker.database import Database
 
 from .stack import PYTHONPATH, Stack, announce, scan_files
 
+NOBODY_S = "5f0c1d9e-0000-4000-8000-000000000000"  # id of nothing
+
 
 def status(stack: Stack, key: str | None, method: str = "GET", path: str = "/v1/jobs", **more: Any) -> int:
     with stack.client(key) as http:
@@ -84,17 +86,17 @@ def test_an_expired_key_is_refused(keyed: Stack) -> None:
 
 CALLS = [
     ("GET", "/v1/jobs", "read"),
-    ("GET", f"/v1/jobs/{uuid4()}/results", "read"),
+    ("GET", f"/v1/jobs/{NOBODY_S}/results", "read"),
     ("GET", "/v1/scans", "read"),
     ("POST", "/v1/uploads", "submit"),
-    ("GET", f"/v1/uploads/{uuid4()}", "submit"),
-    ("HEAD", f"/v1/uploads/{uuid4()}/files/a", "submit"),
-    ("DELETE", f"/v1/uploads/{uuid4()}", "submit"),
+    ("GET", f"/v1/uploads/{NOBODY_S}", "submit"),
+    ("HEAD", f"/v1/uploads/{NOBODY_S}/files/a", "submit"),
+    ("DELETE", f"/v1/uploads/{NOBODY_S}", "submit"),
     ("POST", "/v1/jobs", "submit"),
-    ("PUT", f"/v1/jobs/{uuid4()}", "submit"),
-    ("POST", f"/v1/jobs/{uuid4()}/cancel", "submit"),
-    ("DELETE", f"/v1/jobs/{uuid4()}", "delete"),
-    ("DELETE", f"/v1/scans/{uuid4()}", "delete"),
+    ("PUT", f"/v1/jobs/{NOBODY_S}", "submit"),
+    ("POST", f"/v1/jobs/{NOBODY_S}/cancel", "submit"),
+    ("DELETE", f"/v1/jobs/{NOBODY_S}", "delete"),
+    ("DELETE", f"/v1/scans/{NOBODY_S}", "delete"),
     ("GET", "/metrics", "admin"),
 ]
 
