@@ -92,6 +92,7 @@ def said(result: Reconstruction) -> dict:
     return next(f for f in result.report["findings"] if f["name"] == "exposure")
 
 
+@pytest.mark.slow
 def test_a_drifting_tube_is_found_and_does_no_harm() -> None:
     drift = np.linspace(-0.05, 0.05, 24) + np.random.default_rng(4).normal(0, 0.02, 24)
     scan, true = drifting(drift)

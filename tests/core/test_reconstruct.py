@@ -73,6 +73,7 @@ def test_good_poses_are_left_alone(tmp_path):
     assert free["psnr"] > fixed["psnr"] - 0.5
 
 
+@pytest.mark.slow
 def test_centre_of_rotation(tmp_path):
     scan = scan_of(tmp_path / "scan", Simulation(views=40, det=64, offset_px=(2.5, 0.0), noise="none"), edge=32)
     result = drain(reconstruct(scan, Options(calibrate="static", threads=1)))
@@ -195,6 +196,7 @@ def test_few_views_do_not_crash(tmp_path, views):
     assert np.isfinite(result.volume).all() and np.isfinite(result.corrected.source).all()
 
 
+@pytest.mark.slow
 def test_a_bad_pixel_mask_is_obeyed(tmp_path):
     scan = scan_of(tmp_path, Simulation(views=24, det=48), edge=24)
     bad = np.zeros((48, 48), bool)

@@ -48,6 +48,7 @@ def restored(source: Path, folder: Path) -> Iterator[tuple[Stack, dict[str, Any]
         yield stack, json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_a_running_server_is_backed_up_and_its_jobs_run_again(stack: Stack, tmp_path: Path) -> None:
     stack.start_worker()
     scan = commit(stack.http, scan_files())
@@ -84,6 +85,7 @@ def test_a_running_server_is_backed_up_and_its_jobs_run_again(stack: Stack, tmp_
     assert stack.wait(slow, "succeeded", seconds=60)["attempt"] == 1
 
 
+@pytest.mark.slow
 def test_a_backup_while_things_come_and_go_is_whole(stack: Stack, tmp_path: Path) -> None:
     """What is deleted, finished or sent in the meantime leaves nothing that the restored server misses."""
     stop, faults = threading.Event(), []

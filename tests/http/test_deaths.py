@@ -76,6 +76,7 @@ def step_kept(stack: Stack, job_id: str) -> int:
         return int(json.loads(file.read("state.json"))["dict"]["step"])
 
 
+@pytest.mark.slow
 def test_no_more_than_one_checkpoint_of_work_is_lost(stack: Stack) -> None:
     """Worker killed, then everything but the data folder killed: the next attempt begins where the last state was
     kept, and nothing before that is done twice."""
@@ -132,6 +133,7 @@ def test_the_real_engine_killed_twice_gives_the_bits_of_one_that_was_not(stack: 
         assert got[0] == got[1], name
 
 
+@pytest.mark.slow
 def test_a_drained_worker_loses_no_work(stack: Stack) -> None:
     worker = stack.start_worker()
     job_id = long_job(stack, steps=100)

@@ -124,6 +124,7 @@ def test_only_what_was_asked_for_is_told(told: Stack, receiver: Receiver) -> Non
     assert len(log_of(told, hook)) == 1
 
 
+@pytest.mark.slow
 def test_it_is_told_again_until_it_is_taken_under_one_id(told: Stack, receiver: Receiver) -> None:
     receiver.answers = [(500, {}), (503, {}), (302, {"Location": "http://127.0.0.1:1/elsewhere"})]
     hook = add(told, receiver.url)
