@@ -147,12 +147,6 @@ class Intake:
             (self._scans / scan_id).rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
 
-    def upload_folders(self) -> list[str]:
-        return [folder.name for folder in self._uploads.iterdir()]
-
-    def scan_folders(self) -> list[str]:
-        return [folder.name for folder in self._scans.iterdir()]
-
     @contextlib.contextmanager
     def _locked(self, upload_id: str, how: int, wait_s: float) -> Iterator[None]:
         try:

@@ -153,10 +153,6 @@ class JobFolder:
         """Make attempt `number` the job's results, durably and in one step."""
         self._publish(self.attempt(number), self.results)
 
-    def published_partial(self) -> bool:
-        """Whether a run that was ended early left a result."""
-        return (self.partial / "manifest.json").is_file()
-
     def publish_partial(self, number: int) -> bool:
         """Keep what attempt `number` had made when it was asked to end; False if it had made nothing whole."""
         made = self.results if self.published() else self.attempt(number)

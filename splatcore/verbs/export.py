@@ -29,12 +29,9 @@ def run(args: argparse.Namespace) -> int:
         raise ExportError(f"{args.out}: exists already; name another file, or remove it")
     try:
         if args.toolkit == "rtk":
-            text, note = (
-                rtk_geometry(frames),
-                "RTK's axes x, y, z are ours y, z, x: a volume [z, y, x] is its [x, z, y]",
-            )
-            flipped = upside_down(frames)
-            note += "; turn every projection upside down (flip rows)" if flipped else "; projections as they are"
+            text, flipped = rtk_geometry(frames), upside_down(frames)
+            note = "RTK's axes x, y, z are ours y, z, x: a volume [z, y, x] is its [x, z, y]; "
+            note += "turn every projection upside down (flip rows)" if flipped else "projections as they are"
             with renamed(args.out) as file:
                 file.write(text.encode())
             said: dict[str, str | bool] = {"flip_rows": flipped}

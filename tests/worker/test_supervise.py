@@ -336,4 +336,4 @@ def test_cancelled_after_the_rename_has_them_as_a_partial_result(
     job = run(new_job())
     folder = JobFolder(tmp_path, job.id)
     assert job.state is State.CANCELLED and job.partial
-    assert not folder.results.exists() and folder.published_partial()
+    assert not folder.results.exists() and (folder.partial / "manifest.json").is_file()
