@@ -10,19 +10,21 @@ from typing import Any
 
 import numpy as np
 
+from splatcore import _native
 from splatcore.descent import Descent
 from splatcore.exposure import Exposure
 from splatcore.gate import Decision, gate, information
 from splatcore.gauge import settle
 from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.jitter import narrowed
+from splatcore.lowpass import low_passed
 from splatcore.options import Options
 from splatcore.planar import unseen
 from splatcore.poses import Normals, Prior, accumulate, step_full
 from splatcore.pyramid import Level
 from splatcore.redundancy import lopsidedness, orbit
 from splatcore.scan import Scan
-from splatcore.splats import Similarity
+from splatcore.splats import Similarity, Splats
 from splatcore.static import (
     Static,
     accumulate_static,
@@ -41,6 +43,7 @@ _CAUTION = 1000.0
 _LOPSIDED = 0.2  # share of the detector's half by which the axis may be off its middle
 STATIC_FIRST = 3  # sweeps of the coarsest level that move no single view
 _REACH_PX = 1.5  # longest pose step, in pixels of the level
+_NORMAL = 1.2533  # standard deviation over mean absolute deviation, of normal noise
 _HUBER = 2.0  # standard deviations of the residual beyond which a pixel counts less for the poses
 
 # The prior where the scanner states no tolerance: degrees, and a share of the volume's half width.
@@ -133,12 +136,32 @@ class Calibration:
 
     def accumulate(self, here: Level, descent: Descent, some: slice = slice(None)) -> Normals:
         """Normal equations of all or some views, with the detector's yaw as long as it is solved."""
-        huber = self._huber(here)
-        nominal, motions, images = here.nominal[some], self.motions[some], here.images[some]
-        renderer, splats, static = descent.renderer, descent.splats, self.at(here.nominal)
+        return self._accumulate(here, descent.renderer, descent.splats, self._huber(here), some)
+
+    def _accumulate(
+        self, here: Level, renderer: _native.Renderer32, splats: Splats, huber: float, some: slice = slice(None)
+    ) -> Normals:
+        nominal, motions, images, static = (
+            here.nominal[some],
+            self.motions[some],
+            here.images[some],
+            self.at(here.nominal),
+        )
         if self._alone or self._yaw_free:
             return accumulate_static(renderer, splats, nominal, static, motions, images, here.mask, huber)
         return accumulate(renderer, splats, motions.correct(static.apply(nominal)), images, here.mask, huber)
+
+    def _softened(self, here: Level, descent: Descent) -> tuple[Normals, float]:
+        """Normal equations at the resolution that the splats have, and how many pixels count as one there."""
+        frames = self.corrected(here.nominal)
+        soft = low_passed(here, frames, descent.renderer, descent.splats, self._threads)
+        if soft is None:
+            normals = self.accumulate(here, descent)
+            self._deviation = _deviation(normals)
+            return normals, 1.0
+        self._deviation = _NORMAL * soft.rough
+        huber = max(_HUBER * _NORMAL * soft.smooth, 1e-12 * float(np.abs(here.images).max()))
+        return self._accumulate(soft.here, soft.renderer, descent.splats, huber), soft.shared
 
     def _huber(self, here: Level) -> float:
         return _HUBER * self._deviation or float(np.abs(here.images).max())
@@ -168,15 +191,18 @@ class Calibration:
         """One Gauss-Newton step of all poses; the splats follow strain and gauge. Returns how far poses moved."""
         before, static = self.motions, self.at(here.nominal)
         coarse = here.factor > finest or self._sweeps < STATIC_FIRST
-        caution = _CAUTION if coarse else 1.0
         alone = self._alone
         # Four numbers need not see every view of a fine level.
         some = slice(self._sweeps % 3, None, 3) if alone and here.factor <= 2 and len(before) > 40 else slice(None)
-        normals = self.accumulate(here, descent, some)
+        caution = _CAUTION if coarse else 1.0
+        if coarse or alone:
+            normals = self.accumulate(here, descent, some)
+            self._deviation = _deviation(normals)
+        else:
+            normals, caution = self._softened(here, descent)
         self.normals = normals
         self._sweeps += 1
         self.static_sweeps -= 1
-        self._deviation = 1.2533 * float(normals.residual_abs.sum() / max(normals.pixels.sum(), 1.0))
         similarity = Similarity(np.eye(3), np.zeros(3))
         if alone:
             static, strain, _ = step_static(normals, here.nominal[some], static, before[some], self.prior, caution)
@@ -237,6 +263,11 @@ class Calibration:
         if corrected.line:  # likewise out of the plane
             omega[unseen(corrected)[0]] = tau[unseen(corrected)[1]] = np.inf
         return omega, tau
+
+
+def _deviation(normals: Normals) -> float:
+    """Standard deviation of the residual, outliers hardly counted. Line integral."""
+    return _NORMAL * float(normals.residual_abs.sum() / max(normals.pixels.sum(), 1.0))
 
 
 def _prior(scan: Scan, half: float) -> Prior:

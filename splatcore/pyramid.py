@@ -62,8 +62,10 @@ def level(scan: Scan, factor: int) -> Level:
         (grid.voxel_mm[0] * down[0], grid.voxel_mm[1] * down[1], grid.voxel_mm[2] * down[2]),
         grid.center_mm,
     )
-    mask = None if good is None else _bin(good[None], binning)[0]
-    return Level(factor, binning, scan.frames.binned(*binning), _bin(scan.projections, binning, good), mask, coarse)
+    mask = None if good is None else means_of_blocks(good[None], binning)[0]
+    return Level(
+        factor, binning, scan.frames.binned(*binning), means_of_blocks(scan.projections, binning, good), mask, coarse
+    )
 
 
 def _factor_of(side: int, factor: int) -> int:
@@ -71,7 +73,7 @@ def _factor_of(side: int, factor: int) -> int:
     return next(f for f in _FACTORS if f == 1 or (f <= factor and side // f >= _FEWEST_PIXELS))
 
 
-def _bin(images: Floats, binning: tuple[int, int], good: Floats | None = None) -> Floats:
+def means_of_blocks(images: Floats, binning: tuple[int, int], good: Floats | None = None) -> Floats:
     """Means of blocks, of their good pixels where there are any; rows and columns that fill no block are dropped."""
     down, across = binning
     if binning == (1, 1):
