@@ -9,7 +9,7 @@ from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 
 from server import costs
-from server.answers import job_out, retry_after
+from server.answers import job_out, jobs_out, retry_after
 from server.problems import ApiProblem, not_found
 from server.schema import EstimateOut, EventList, JobIn, JobList, JobOut, RestartIn
 from server.service import Served, Service
@@ -62,7 +62,7 @@ def list_jobs(
     jobs = service.store.jobs.page(state, limit + 1, None if before is None else service.job(before))
     more = len(jobs) > limit
     jobs = jobs[:limit]
-    return JobList(jobs=[job_out(service, job) for job in jobs], next=jobs[-1].id if more else None)
+    return JobList(jobs=jobs_out(service, jobs), next=jobs[-1].id if more else None)
 
 
 @router.post("/jobs/{job_id}/cancel", status_code=202)

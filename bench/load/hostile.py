@@ -40,7 +40,7 @@ def hostile(every: int, say: Callable[[str], None]) -> Measured:
         Figure("processor time of the check, most", max(cost["cpu_s"] for cost in took.values()), "s"),
         Figure(f"memory of the check, most: {largest}", took[largest]["peak_mb"], "MB", at_most=MOST_MB),
     ]
-    how = f"The commit of {len(names)} hostile scans, once each, one after the other; the upload before it is not counted."
+    how = f"The commit of {len(names)} hostile scans, once each, one after the other; their upload is not counted."
     return Measured("Refusing hostile scans", how, figures, took)
 
 

@@ -79,8 +79,8 @@ def idle(seconds: float, say: Callable[[str], None]) -> Measured:
     for kind, cost in watched.items():
         figures += cost.figures(f"{PAGES} pages {kind}, a job at work")
     how = (
-        f"{seconds:.0f} s each; {_JOBS} finished jobs in the database, two workers. A job at work that says something every "
-        f"second. Polling: half of the pages ask for the list, half for the job and its news, every {_PAGE_S:g} s, as the "
+        f"{seconds:.0f} s each; {_JOBS} finished jobs kept, two workers; the job at work has news every second. "
+        f"Polling: half of the pages ask for the list, half for the job and its news, every {_PAGE_S:g} s, as the "
         "status page does. Streaming: each follows the job's events."
     )
     return Measured("The cost of idling and of being watched", how, figures)

@@ -31,7 +31,7 @@ def memory(jobs: int, say: Callable[[str], None]) -> Measured:
     count, *held = np.array(samples, float).T
     figures = []
     for name, one, most in (("server", held[0], MOST_PER_JOB), ("workers, mean", np.mean(held[1:], axis=0), None)):
-        slope, error = _slope(count, one)
+        slope, error = growth(count, one)
         figures += [
             Figure(f"{name}: after {_WARM:.0%} of the jobs", _after(count, one, _WARM * jobs) / 1e6, "MB"),
             Figure(f"{name}: after all", one[-1] / 1e6, "MB"),
@@ -39,9 +39,9 @@ def memory(jobs: int, say: Callable[[str], None]) -> Measured:
             Figure(f"{name}: growth, standard error", error, "bytes/job"),
         ]
     how = (
-        f"{jobs} jobs with the tests' engine, {_WORKERS} workers, {_CALLERS} callers; each job is submitted, waited for by "
-        "long poll, and its events, manifest, volume and a slice are fetched; the list of jobs, too. Resident memory at "
-        f"every tenth; growth is the slope of a line through what came after the first {_WARM:.0%}."
+        f"{jobs} jobs with the tests' engine, {_WORKERS} workers, {_CALLERS} callers; each job is submitted, waited "
+        "for by long poll, and its events, manifest, volume and a slice are fetched, the list of jobs too. Resident "
+        f"memory at every tenth; growth is the slope of a line through what came after the first {_WARM:.0%}."
     )
     return Measured("Memory over many jobs", how, figures, {"jobs, server, workers (bytes)": samples})
 
@@ -104,7 +104,7 @@ class _Run:
                 self._say(f"memory: {self._done} of {self._jobs} jobs")
 
 
-def _slope(count: np.ndarray, held: np.ndarray) -> tuple[float, float]:
+def growth(count: np.ndarray, held: np.ndarray) -> tuple[float, float]:
     """Bytes per job after the warm-up, and the standard error of that."""
     late = count > _WARM * count[-1]
     x, y = count[late] - count[late].mean(), held[late] - held[late].mean()

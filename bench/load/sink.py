@@ -1,4 +1,4 @@
-"""The least that can take an upload in: an ASGI app that writes the body to a file, under the server's uvicorn settings.
+"""The least that can take an upload: an ASGI app that writes the body to a file, under the server's uvicorn settings.
 
 python -m bench.load.sink PORT FOLDER [--fsync]
 """

@@ -34,8 +34,8 @@ def start(submissions: int, say: Callable[[str], None]) -> Measured:
         Figure("to the first progress event, longest", max(first), "s", at_most=MOST_FIRST_S),
     ]
     how = (
-        f"{submissions} submissions of examples/head, one at a time, each when nothing else waits or runs; two workers. "
-        "Counted from before the request is sent; the process by the kernel's start time (10 ms), the event by its own."
+        f"{submissions} submissions of examples/head, one at a time, when nothing else waits or runs; two workers. "
+        "From before the request to the kernel's start time of the process (10 ms), or to the event's own time."
     )
     return Measured("Submission to engine", how, figures, {"engine_s": engine, "first_event_s": first})
 

@@ -37,9 +37,9 @@ def status(seconds: float, file_mib: int, say: Callable[[str], None]) -> Measure
             figures.append(Figure(f"{when}: {route}, median", quantile(ms, 0.5), "ms"))
             figures.append(Figure(f"{when}: {route}, p99 of {len(ms)}", quantile(ms, 0.99), "ms", at_most=most))
     how = (
-        f"One caller, each question after the answer to the one before, on a connection of its own. Four senders PUT "
-        f"files of {file_mib} MiB without a pause; one worker reconstructs examples/head with {threads_allowed()} threads; "
-        f"{_JOBS} jobs in the list."
+        f"One caller, each question after the answer to the one before, on one connection. Four senders PUT files of "
+        f"{file_mib} MiB without a pause; one worker reconstructs examples/head with {threads_allowed()} threads, "
+        f"niced by 5 as by default; {_JOBS} jobs in the list."
     )
     raw = {"only the reconstruction": quiet, "uploads and reconstruction": with_uploads}
     return Measured("Status calls under load", how, figures, raw)

@@ -33,7 +33,7 @@ def uploads(rounds: int, single_mib: int, parallel_mib: int, say: Callable[[str]
             "sink + fsync": lambda senders, size: _to_sink(durable, service.data.parent, senders, size),
             "PATCH": lambda senders, size: _to_service(service.url, patch, senders, size),
         }
-        for name, way in ways.items():  # nobody's first call is to count
+        for way in ways.values():  # nobody's first call is to count
             way(1, 8 * MIB)
         for number in range(rounds):
             for senders, size in ((1, single_mib * MIB), (4, parallel_mib * MIB)):
@@ -44,9 +44,9 @@ def uploads(rounds: int, single_mib: int, parallel_mib: int, say: Callable[[str]
             say(f"uploads: round {number + 1} of {rounds}")
     figures = [figure for among, rates in found.items() for figure in _figures(among, rates)]
     how = (
-        f"{rounds} rounds in turns, medians; {single_mib} MiB from one sender, {parallel_mib} MiB from each of four. The "
-        "sink writes the body to a file and neither hashes nor syncs; `+ fsync` syncs before it answers. Ours hashes, "
-        "and every byte is synced before it is acknowledged. PATCH in chunks of 32 MiB (tus), each acknowledged."
+        f"{rounds} rounds in turns, medians; {single_mib} MiB from one sender, {parallel_mib} MiB from each of four. "
+        "The sink writes the body to a file and neither hashes nor syncs; `+ fsync` syncs before it answers. Ours "
+        "hashes, and syncs every byte before it is acknowledged. PATCH in chunks of 32 MiB (tus), each acknowledged."
     )
     return Measured("Upload throughput", how, figures, found)
 

@@ -8,13 +8,12 @@ import json
 import os
 import time
 from collections.abc import Iterator
-from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 
-from .hostile import ACCEPTED, REFUSED, VIEWS, reaching
+from .hostile import ACCEPTED, COLS, REFUSED, ROWS, VIEWS, reaching
 from .stack import Stack, scan_files, send
 
 MOST_S, MOST_MB = 1.0, 300.0

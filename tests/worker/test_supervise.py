@@ -71,8 +71,8 @@ def test_success(run: Run, new_job: NewJob, tmp_path: Path) -> None:
     assert folder.published() and not folder.checkpoint.exists()
     assert not folder.scan.exists() and not list(folder.path.glob("attempt-*"))
     events = read_events(folder.events, 0, 100)
-    assert [e["stage"] for e in events] == ["read", "level", "level", "level", "level"]
-    assert [e["number"] for e in events] == [1, 2, 3, 4, 5]
+    assert [e["stage"] for e in events] == ["read", "start", "level", "level", "level", "level"]
+    assert [e["number"] for e in events] == [1, 2, 3, 4, 5, 6]
     assert "a stray print" in folder.log.read_text()
 
 
