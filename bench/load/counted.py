@@ -19,7 +19,9 @@ _counts: Counter[str] = Counter()
 
 
 def _count(_connection: Any, _cursor: Any, statement: str, *_: Any) -> None:
-    _counts["write" if statement.lstrip()[:6].upper() in ("INSERT", "UPDATE", "DELETE") else "read"] += 1
+    verb = statement.split(maxsplit=1)[0].upper()
+    if verb != "BEGIN":
+        _counts["write" if verb in ("INSERT", "UPDATE", "DELETE") else "read"] += 1
 
 
 def _tell(*_: Any) -> None:

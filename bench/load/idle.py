@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from multiprocessing.synchronize import Semaphore
 from pathlib import Path
 
 import httpx
@@ -24,6 +25,7 @@ from bench.service import Service, in_passing
 from tests.http.stack import commit, scan_files
 
 PAGES = 50
+_START_S = 60.0
 _PAGE_S = 2.0  # between two refreshes, as static/jobs.js and job.js have it
 _JOBS = 50  # as many as a page shows
 
@@ -72,7 +74,6 @@ def idle(seconds: float, say: Callable[[str], None]) -> Measured:
         watched = {}
         for kind in ("polling", "streaming"):
             with _pages(service, job, streaming=kind == "streaming"):
-                time.sleep(_PAGE_S)
                 watched[kind] = _cost(service, counts, seconds)
             say(f"idle: with {PAGES} pages {kind}")
     figures = [*nobody.figures("nobody, no job"), *running.figures("nobody, a job at work")]
@@ -119,9 +120,16 @@ def _family_s(pid: int) -> float:
 @contextlib.contextmanager
 def _pages(service: Service, job: str, streaming: bool) -> Iterator[None]:
     """Fifty of them in a process of their own, at odds with each other."""
-    process = multiprocessing.get_context("spawn").Process(target=_look, args=(service.url, job, streaming))
+    spawn = multiprocessing.get_context("spawn")
+    there = spawn.Semaphore(0)
+    process = spawn.Process(target=_look, args=(service.url, job, streaming, there))
     process.start()
     try:
+        for page in range(PAGES):
+            if not there.acquire(timeout=_START_S):
+                raise RuntimeError(
+                    f"{page} of {PAGES} pages had an answer; their process's exit code: {process.exitcode}"
+                )
         yield
         if not process.is_alive():
             raise RuntimeError(f"the pages ended with {process.exitcode}")
@@ -130,19 +138,19 @@ def _pages(service: Service, job: str, streaming: bool) -> Iterator[None]:
         process.join()
 
 
-def _look(url: str, job: str, streaming: bool) -> None:
-    asyncio.run(_all_pages(url, job, streaming))
+def _look(url: str, job: str, streaming: bool, there: Semaphore) -> None:
+    asyncio.run(_all_pages(url, job, streaming, there))
 
 
-async def _all_pages(url: str, job: str, streaming: bool) -> None:
+async def _all_pages(url: str, job: str, streaming: bool, there: Semaphore) -> None:
     limits = httpx.Limits(max_connections=PAGES, max_keepalive_connections=PAGES)
     async with httpx.AsyncClient(base_url=url, trust_env=False, timeout=60, limits=limits) as http:
-        pages = [_stream(http, job) if streaming else _poll(http, job, number) for number in range(PAGES)]
+        pages = [_stream(http, job, there) if streaming else _poll(http, job, number, there) for number in range(PAGES)]
         await asyncio.gather(*pages)
 
 
-async def _poll(http: httpx.AsyncClient, job: str, number: int) -> None:
-    last = 0
+async def _poll(http: httpx.AsyncClient, job: str, number: int, there: Semaphore) -> None:
+    last, first = 0, True
     await asyncio.sleep(_PAGE_S * number / PAGES)
     while True:
         if number % 2:
@@ -150,12 +158,16 @@ async def _poll(http: httpx.AsyncClient, job: str, number: int) -> None:
         else:
             (await http.get(f"/v1/jobs/{job}")).raise_for_status()
             last = (await http.get(f"/v1/jobs/{job}/events?after={last}")).raise_for_status().json()["last"]
+        if first:
+            there.release()
+            first = False
         await asyncio.sleep(_PAGE_S)
 
 
-async def _stream(http: httpx.AsyncClient, job: str) -> None:
+async def _stream(http: httpx.AsyncClient, job: str, there: Semaphore) -> None:
     async with http.stream("GET", f"/v1/jobs/{job}/events/stream") as events:
         events.raise_for_status()
+        there.release()
         async for _ in events.aiter_lines():
             pass
     raise RuntimeError("the stream ended, and the job had not")

@@ -54,7 +54,7 @@ def when_running(ledger: Ledger, job: Job, action: Callable[[], object]) -> thre
     def wait() -> None:
         for _ in range(500):
             found = ledger.get(job.id)
-            if (found is not None and found.message == "Reading") or (found and found.stage == "level"):
+            if (found is not None and found.message == "At work") or (found and found.stage == "level"):
                 action()
                 return
             time.sleep(0.02)
