@@ -34,7 +34,7 @@ _FULL: dict[str, Callable[[Say], Measured]] = {
     "start": lambda say: start(20, say),
     "memory": lambda say: memory(1000, say),
     "hostile": lambda say: hostile(1, say),
-    "idle": lambda say: idle(20, say),
+    "idle": lambda say: idle(15, say),
 }
 _QUICK: dict[str, Callable[[Say], Measured]] = {
     "uploads": lambda say: uploads(1, 64, 32, say),
