@@ -34,7 +34,7 @@ _FULL: dict[str, Callable[[Say], Measured]] = {
     "start": lambda say: start(20, say),
     "memory": lambda say: memory(1000, say),
     "hostile": lambda say: hostile(1, say),
-    "idle": lambda say: idle(15, say),
+    "idle": lambda say: idle(15, 50, say),
 }
 _QUICK: dict[str, Callable[[Say], Measured]] = {
     "uploads": lambda say: uploads(1, 64, 32, say),
@@ -42,7 +42,7 @@ _QUICK: dict[str, Callable[[Say], Measured]] = {
     "start": lambda say: start(2, say),
     "memory": lambda say: memory(100, say),
     "hostile": lambda say: hostile(10, say),
-    "idle": lambda say: idle(3, say),
+    "idle": lambda say: idle(3, 10, say),
 }
 
 

@@ -27,7 +27,6 @@ from tests.http.stack import commit, scan_files
 PAGES = 50
 _START_S = 60.0
 _PAGE_S = 2.0  # between two refreshes, as static/jobs.js and job.js have it
-_JOBS = 50  # as many as a page shows
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class _Cost:
         ]
 
 
-def idle(seconds: float, say: Callable[[str], None]) -> Measured:
+def idle(seconds: float, finished: int, say: Callable[[str], None]) -> Measured:
     with (
         tempfile.TemporaryDirectory(prefix="splatct-bench-") as folder,
         in_passing(
@@ -63,7 +62,7 @@ def idle(seconds: float, say: Callable[[str], None]) -> Measured:
         with httpx.Client(base_url=service.url, trust_env=False, timeout=30) as http:
             quick = commit(http, scan_files(steps=1))
             slow = commit(http, scan_files(steps=100_000, pause=1.0))
-        done = [ask(service.url, "POST", "/v1/jobs", {"scan_id": quick})["id"] for _ in range(_JOBS)]
+        done = [ask(service.url, "POST", "/v1/jobs", {"scan_id": quick})["id"] for _ in range(finished)]
         service.until(lambda: _all_done(service, done), 300, "all jobs are done")
         nobody = _cost(service, counts, seconds)
         say("idle: with nobody")
@@ -80,7 +79,7 @@ def idle(seconds: float, say: Callable[[str], None]) -> Measured:
     for kind, cost in watched.items():
         figures += cost.figures(f"{PAGES} pages {kind}, a job at work")
     how = (
-        f"{seconds:.0f} s each; {_JOBS} finished jobs kept, two workers; the job at work has news every second. "
+        f"{seconds:.0f} s each; {finished} finished jobs kept, two workers; the job at work has news every second. "
         f"Polling: half of the pages ask for the list, half for the job and its news, every {_PAGE_S:g} s, as the "
         "status page does. Streaming: each follows the job's events."
     )
