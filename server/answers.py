@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from server.schema import JobOut
 from server.service import Service
 from worker.contract import FINISHED, State
@@ -12,6 +14,12 @@ _POLL_S = {State.QUEUED: 5}  # all others: 1
 
 def job_out(service: Service, job: Job) -> JobOut:
     return JobOut.of(job, service.store.jobs.position(job) if job.state is State.QUEUED else None)
+
+
+def jobs_out(service: Service, jobs: Sequence[Job]) -> list[JobOut]:
+    """Many, with one look at the queue."""
+    queue = service.store.jobs.positions() if any(job.state is State.QUEUED for job in jobs) else {}
+    return [JobOut.of(job, queue.get(job.id)) for job in jobs]
 
 
 def retry_after(state: State) -> dict[str, str]:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Protocol
 from uuid import uuid4
 
+from server.writeback import Writeback
 from worker.jobfolder import link_or_copy, sync_file, sync_folder
 
 
@@ -47,6 +48,7 @@ class Arrival:
         self._size = size
         self._expected = expected_sha256
         self._digest = hashlib.sha256()
+        self._writeback = Writeback(self._file.fileno())
         self._received = 0
 
     def write(self, chunk: bytes) -> None:
@@ -55,6 +57,7 @@ class Arrival:
             raise Mismatch(f"more than the announced {self._size} bytes arrived")
         self._digest.update(chunk)
         self._file.write(chunk)
+        self._writeback.reached(self._received)
 
     def complete(self) -> str:
         """Check size and digest and make the bytes durable; returns the sha256."""

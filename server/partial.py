@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from server.intake import Busy, Mismatch
+from server.writeback import Writeback
 from worker.jobfolder import sync_folder
 
 
@@ -34,6 +35,7 @@ class Partial:
                 sync_folder(parts)
             self.acknowledged = self.offset = min(acknowledged, os.fstat(self._file.fileno()).st_size)
             self._truncate()
+            self._writeback = Writeback(self._file.fileno(), self.offset)
         except BlockingIOError:
             self._file.close()
             raise Busy from None
@@ -50,6 +52,7 @@ class Partial:
                 written = self._file.write(rest)
                 self.offset += written
                 rest = rest[written:]
+            self._writeback.reached(self.offset)
 
     def acknowledge(self) -> None:
         """Make what was written count."""

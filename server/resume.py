@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator
 from typing import Annotated
 from uuid import UUID
 
-import anyio
 from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
 from sqlalchemy.exc import DBAPIError
@@ -19,6 +18,7 @@ from server.partial import Partial, take_back
 from server.problems import ApiProblem, disk_is_full, invalid, not_found
 from server.service import Served, Service
 from server.settings import MIB
+from server.spool import Spool
 from server.store import File
 from server.turns import Turn
 from splatcore.errors import Problem
@@ -29,7 +29,6 @@ router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 TUS = {"Tus-Resumable": "1.0.0"}
 MEDIA_TYPE = "application/offset+octet-stream"
 BYTES = {"type": "string", "format": "binary"}
-BUFFER = MIB
 ACKNOWLEDGE_EVERY = 16 * MIB  # a crash costs at most this much of a chunk, however long the chunk is
 
 FileName = Annotated[str, Path(max_length=1024)]
@@ -136,28 +135,26 @@ async def _opened(service: Service, upload_id: str, name: str) -> AsyncIterator[
 
 async def _receive(request: Request, turn: Turn, name: str, partial: Partial, digests: list[Claim]) -> None:
     """Stream a chunk to disk. What counts at the end is acknowledged; a problem is raised if that is not all."""
-    start, pending, cut = partial.acknowledged, bytearray(), False
+    start, cut = partial.acknowledged, False
 
-    async def save() -> None:
-        nonlocal pending
-        block, pending = bytes(pending), bytearray()
-        with anyio.CancelScope(shield=True):  # a block is written whole or not taken from the stream
-            await _digested(partial, digests, block)
-            if not digests and partial.offset - partial.acknowledged >= ACKNOWLEDGE_EVERY:
-                await to_thread.run_sync(partial.acknowledge)
+    def save(block: bytes) -> None:
+        for claim in digests:
+            claim.update(block)
+        partial.write(block)
+        if not digests and partial.offset - partial.acknowledged >= ACKNOWLEDGE_EVERY:
+            partial.acknowledge()
 
     try:
-        with turn.scope:
-            try:
-                async for piece in request.stream():
-                    pending += piece
-                    if len(pending) >= BUFFER:
-                        await save()
-            except ClientDisconnect:
-                cut = True
-        taken_over = turn.scope.cancelled_caught
-        if not (digests and (cut or taken_over)):
-            await save()
+        async with Spool(save) as spool:
+            with turn.scope:
+                try:
+                    async for piece in request.stream():
+                        await spool.give(piece)
+                except ClientDisconnect:
+                    cut = True
+            taken_over = turn.scope.cancelled_caught
+            if not (digests and (cut or taken_over)):
+                await spool.empty()
     except Mismatch as mismatch:
         await to_thread.run_sync(partial.drop_chunk)
         raise _refused(name, partial.offset, str(mismatch)) from None
@@ -188,15 +185,6 @@ async def _acknowledged(partial: Partial) -> None:
             raise
         await to_thread.run_sync(partial.drop_chunk)
         raise _full(partial) from None
-
-
-async def _digested(partial: Partial, digests: list[Claim], block: bytes) -> None:
-    def work() -> None:
-        for claim in digests:
-            claim.update(block)
-        partial.write(block)
-
-    await to_thread.run_sync(work)
 
 
 async def _finished(service: Service, upload_id: str, file: File, partial: Partial) -> str | None:

@@ -58,7 +58,7 @@ class Service:
         return job
 
 
-def _serving(request: Request) -> Service:
+async def _serving(request: Request) -> Service:  # async: FastAPI would take a thread for it
     service: Service = request.app.state.service
     return service.serving(request.state.caller)
 

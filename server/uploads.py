@@ -20,13 +20,12 @@ from server.problems import ApiProblem, invalid, not_found
 from server.scans import scan_out
 from server.schema import FileOut, ScanOut, UploadIn, UploadOut, moment
 from server.service import Served, Service
-from server.settings import MIB
+from server.spool import Spool
 from server.store import File, Scan, Upload
 from splatcore.errors import Problem, ScanError
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
-BUFFER = MIB
 COMMIT_WAIT_S = 30.0
 _checks = threading.BoundedSemaphore(2)  # checks are processes; more at once would only wait for the disk
 
@@ -150,16 +149,13 @@ async def _receive(request: Request, service: Service, upload_id: str, file: Fil
     async with service.turns.take(upload_id, file.name) as turn:
         arrival = await to_thread.run_sync(Arrival, parts, file.size, file.expected_sha256)
         try:
-            pending = bytearray()
-            with turn.scope:
-                async for chunk in request.stream():
-                    pending += chunk
-                    if len(pending) >= BUFFER:
-                        await to_thread.run_sync(arrival.write, bytes(pending))
-                        pending.clear()
-            if turn.scope.cancelled_caught:
-                raise ApiProblem(409, "taken-over", "A newer request writes this file now.")
-            await to_thread.run_sync(arrival.write, bytes(pending))
+            async with Spool(arrival.write) as spool:
+                with turn.scope:
+                    async for piece in request.stream():
+                        await spool.give(piece)
+                if turn.scope.cancelled_caught:
+                    raise ApiProblem(409, "taken-over", "A newer request writes this file now.")
+                await spool.empty()
             sha256 = await to_thread.run_sync(arrival.complete)
 
             def record() -> None:

@@ -1,4 +1,4 @@
-"""uvicorn's HTTP protocol, with an end to how long a request's head may go on.
+"""How uvicorn listens: its HTTP protocol, with an end to how long a request's head may go on.
 
 httptools keeps a header until it is whole, and has no limit of its own: one that never ends would fill the
 memory before any middleware is asked. Heads that do end are judged by `server.guard`, which answers in full.
@@ -6,6 +6,9 @@ memory before any middleware is asked. Heads that do end are judged by `server.g
 
 from __future__ import annotations
 
+from typing import Any
+
+import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from server.limits import HEAD_BYTES
@@ -41,3 +44,18 @@ class BoundedHead(HttpToolsProtocol):
     def on_message_complete(self) -> None:
         super().on_message_complete()
         self._in_body, self._pending = False, 0
+
+
+def uvicorn_config(app: Any, host: str, port: int, **more: Any) -> uvicorn.Config:
+    """The server's, for any app; `bench.load` puts another one behind it. `more`: what uvicorn.Config takes."""
+    return uvicorn.Config(
+        app,
+        http=BoundedHead,
+        host=host,
+        port=port,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=5,
+        **more,
+    )

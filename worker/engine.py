@@ -63,9 +63,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _work(folder: JobFolder, attempt: int, engine: str, say: Say) -> int:
     spec = json.loads(folder.spec.read_bytes())
-    limit_self(spec.get("memory_mib", 0), spec.get("file_mib", 1 << 20))
+    limit_self(spec.get("memory_mib", 0), spec.get("file_mib", 1 << 20), spec.get("nice", 0))
     options = Options.from_dict(spec["options"])
     requests = _requests(folder, attempt, spec)
+    say(Progress("read", 0.0, "Reading the scan").to_json())  # takes a while, as do the imports that it needs
     scan = _part(engine, "scan", "read_scan")(folder.scan)
     if requests.look() in _ASKED:  # before there was anything to keep
         return _ASKED[requests.wish]

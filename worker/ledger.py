@@ -138,7 +138,7 @@ class Ledger:
         """The place of every queued job among its tenant's, 1 for the one that is next: how many others wait is
         theirs to know."""
         with self._database.reading() as read:
-            query = sa.select(jobs.c.id, _place()).where(jobs.c.state == State.QUEUED)
+            query = sa.select(jobs.c.id, _place()).where(jobs.c.state == State.QUEUED, self._mine())
             return {job_id: int(number) for job_id, number in read.execute(query)}
 
     def position(self, job: Job) -> int:

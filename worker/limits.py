@@ -2,12 +2,14 @@
 
 Address space is limited by the memory that this process may use (its cgroup's, or the machine's) and some more, for
 libraries and thread stacks that are mapped but hardly touched: so a reconstruction that grows too large gets a
-MemoryError, which can be told from a crash, before the kernel kills it.
+MemoryError, which can be told from a crash, before the kernel kills it. Of the processors it takes what others leave:
+whoever asks the server for a job's state must not wait for a reconstruction on the same machine.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import resource
 from pathlib import Path
 
@@ -17,8 +19,10 @@ MIB = 1 << 20
 _MAPPED = 2048 * MIB
 
 
-def limit_self(memory_mib: int, file_mib: int) -> None:
-    """memory_mib: 0: what the machine gives; file_mib: of the largest file that may be written. No core files."""
+def limit_self(memory_mib: int, file_mib: int, nice: int) -> None:
+    """memory_mib: 0: what the machine gives; file_mib: of the largest file that may be written; nice: by how much its
+    priority is lowered. No core files."""
+    os.nice(nice)
     memory = memory_mib * MIB or memory_bytes()[1]
     if memory:
         _lower(resource.RLIMIT_AS, memory + _MAPPED)

@@ -151,7 +151,7 @@ class _Attempt:
         spec = {
             "id": job.id, "attempt": job.attempt, "options": job.options, "checkpoint_s": settings.checkpoint_s,
             "memory_mib": settings.engine_memory_mib, "file_mib": settings.engine_file_mib,
-            "test": settings.test_plan,
+            "nice": settings.engine_nice, "test": settings.test_plan,
         }  # fmt: skip
         self._folder.prepare(spec, job.attempt)
         with EventWriter(self._folder.events) as events:

@@ -11,16 +11,13 @@ twice or stuck, or if an upload was committed as something else than what was se
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
-import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
-from bench.faults.campaign import Campaign, Counts, Outcome
-from bench.faults.service import CHECKPOINT_S, Service
+from bench.faults.campaign import CHECKPOINT_S, SETTINGS, Campaign, Counts, Outcome
 from bench.faults.uploads import run_uploads
+from bench.service import in_passing
 
 _FULL = Counts(kills=100, server=20, redis=20, wipes=10, drains=10)
 _QUICK = Counts(kills=10, server=2, redis=2, wipes=1, drains=1)
@@ -43,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     if args.only != "jobs":
         began = time.monotonic()
-        with _service(workers=0) as service:
+        with in_passing(workers=0) as service:
             cut = run_uploads(service, uploads, args.seed, print)
         minutes = (time.monotonic() - began) / 60
         found["uploads"] = {**cut.to_json(), "minutes": round(minutes, 1)}
@@ -51,7 +48,7 @@ def main(argv: list[str] | None = None) -> int:
         good = good and cut.good()
     if args.only != "uploads":
         began = time.monotonic()
-        with _service(args.workers) as service:
+        with in_passing(args.workers, SETTINGS) as service:
             outcome = Campaign(service, _QUICK if args.quick else _FULL, args.seed, print).run()
         took = time.monotonic() - began
         found |= {**outcome.to_json(), "workers": args.workers, "minutes": round(took / 60, 1)}
@@ -61,13 +58,6 @@ def main(argv: list[str] | None = None) -> int:
     (args.out / "faults.md").write_text(page)
     print(page)
     return 0 if good else 1
-
-
-@contextlib.contextmanager
-def _service(workers: int) -> Iterator[Service]:
-    with tempfile.TemporaryDirectory(prefix="splatct-faults-", ignore_cleanup_errors=True) as folder:
-        with Service(Path(folder), workers) as service:
-            yield service
 
 
 def report(out: Outcome, seed: int, workers: int, seconds: float) -> str:

@@ -17,11 +17,16 @@ from redis import Redis
 from redis.exceptions import RedisError
 from splatct_client.errors import ClientError
 
-from bench.faults.service import Service
+from bench.service import Service
+from splatcore.simulate import Simulation
 
 _FINISHED = ("succeeded", "failed", "cancelled")
 _PAUSE_S = (0.5, 3.0)  # between two faults
 _WAITING = 3  # jobs that are kept waiting or at work, for each worker
+_OPTIONS = {"quality": "preview", "calibrate": "full", "splats": 1500, "threads": 1}
+_SCAN = Simulation(views=16, det=48, sigma_rot=0.02, sigma_trans=1.0, seed=1)
+CHECKPOINT_S = 1.0
+SETTINGS = {"checkpoint_s": CHECKPOINT_S, "test_mode": 1, "test_step_s": 0.004}  # the real engine, slowed
 _END_S = 600.0  # after the last fault: a job that has not ended by then is stuck
 
 
@@ -75,6 +80,7 @@ class Campaign:
         plan += ["wipe"] * counts.wipes + ["drain"] * counts.drains
         self._rng.shuffle(plan)
         self._plan = plan
+        self._scan = service.send_body(24, _SCAN)
         self._ids: list[str] = []
         self._victims: list[tuple[str, str, int, float]] = []  # kind, job, its attempt, when
         self._outcome = Outcome()
@@ -103,7 +109,9 @@ class Campaign:
                 under_way = sum(job["state"] not in _FINISHED for job in jobs.values())
                 if under_way < _WAITING * len(self._service.workers):
                     with contextlib.suppress(ClientError):  # the server may just have been killed
-                        self._ids.append(self._service.submit(len(self._ids)))
+                        self._ids.append(
+                            self._service.client.submit(self._scan, {**_OPTIONS, "seed": len(self._ids)}).id
+                        )
             time.sleep(0.05)
 
     def _watch(self, jobs: dict[str, dict[str, Any]]) -> None:

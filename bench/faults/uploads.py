@@ -20,7 +20,7 @@ import httpx
 import numpy as np
 import tifffile
 
-from bench.faults.service import Service
+from bench.service import Service
 
 # How one upload is disturbed, and of how many: killing the server takes the longest.
 KINDS = {"client": 40, "server": 10, "overlap": 20, "repeat": 15, "reorder": 15}

@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from server.app import create_app
     from server.opening import make_ready
     from server.settings import Settings
-    from server.wire import BoundedHead
+    from server.wire import uvicorn_config
     from worker.lifeline import die_with_parent
 
     if args.tie_to is not None:
@@ -51,17 +51,7 @@ def run(args: argparse.Namespace) -> int:
                 service.watch.close()
             super().handle_exit(sig, frame)
 
-    config = uvicorn.Config(
-        app,
-        http=BoundedHead,
-        host=settings.host,
-        port=settings.port,
-        log_config=None,
-        access_log=False,
-        server_header=False,
-        forwarded_allow_ips=settings.trusted_proxies,
-        timeout_graceful_shutdown=5,
-    )
+    config = uvicorn_config(app, settings.host, settings.port, forwarded_allow_ips=settings.trusted_proxies)
     server = Server(config)
     server.run()
     return 0 if server.started else 3

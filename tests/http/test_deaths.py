@@ -268,7 +268,7 @@ def test_a_server_killed_between_commit_steps_commits_on_the_next_call(stack: St
 def test_a_cancelled_job_whose_worker_died_ends(stack: Stack) -> None:
     worker = stack.start_worker()
     job_id = submit(stack.http, commit(stack.http, scan_files(deaf=True)))
-    stack.until(lambda: stack.job(job_id)["message"] == "Reading", what="the engine is at work")
+    stack.until(lambda: stack.job(job_id)["message"] == "At work", what="the engine is at work")
     os.kill(worker.pid, signal.SIGSTOP)  # it cannot see the request
     stack.http.post(f"/v1/jobs/{job_id}/cancel")
     kill(worker)

@@ -38,7 +38,13 @@ def folder(new_job: NewJob, settings: WorkerSettings, tmp_path: Path) -> JobFold
 def test_events_go_to_stdout_and_nothing_else(folder: JobFolder) -> None:
     done = engine(folder, os.getpid())
     assert done.returncode == Exit.OK
-    assert [json.loads(line)["stage"] for line in done.stdout.splitlines()] == ["read", "level", "level", "level"]
+    assert [json.loads(line)["stage"] for line in done.stdout.splitlines()] == [
+        "read",
+        "start",
+        "level",
+        "level",
+        "level",
+    ]
     manifest = json.loads((folder.attempt(1) / "manifest.json").read_text())
     assert manifest["options"]["quality"] == "fine"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from worker.process import clean_environment
 
 
 def limited(code: str, memory_mib: int = 0, file_mib: int = 64) -> subprocess.CompletedProcess[str]:
-    script = f"from worker.limits import limit_self\nlimit_self({memory_mib}, {file_mib})\n{code}"
+    script = f"from worker.limits import limit_self\nlimit_self({memory_mib}, {file_mib}, nice=3)\n{code}"
     command = [sys.executable, "-c", script]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, env=clean_environment())
 
@@ -37,6 +38,10 @@ def test_no_core_and_first_in_line_when_memory_runs_out() -> None:
         "import resource; print(resource.getrlimit(resource.RLIMIT_CORE)[0], open('/proc/self/oom_score_adj').read())"
     )
     assert limited(code).stdout.split() == ["0", "500"]
+
+
+def test_it_gives_way_to_others() -> None:
+    assert int(limited("import os; print(os.nice(0))").stdout) == os.nice(0) + 3
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ def when_running(ledger: Ledger, job: Job, action: Callable[[], object]) -> thre
     def wait() -> None:
         for _ in range(500):
             found = ledger.get(job.id)
-            if (found is not None and found.message == "Reading") or (found and found.stage == "level"):
+            if (found is not None and found.message == "At work") or (found and found.stage == "level"):
                 action()
                 return
             time.sleep(0.02)
@@ -71,8 +71,8 @@ def test_success(run: Run, new_job: NewJob, tmp_path: Path) -> None:
     assert folder.published() and not folder.checkpoint.exists()
     assert not folder.scan.exists() and not list(folder.path.glob("attempt-*"))
     events = read_events(folder.events, 0, 100)
-    assert [e["stage"] for e in events] == ["read", "level", "level", "level", "level"]
-    assert [e["number"] for e in events] == [1, 2, 3, 4, 5]
+    assert [e["stage"] for e in events] == ["read", "start", "level", "level", "level", "level"]
+    assert [e["number"] for e in events] == [1, 2, 3, 4, 5, 6]
     assert "a stray print" in folder.log.read_text()
 
 

@@ -18,6 +18,7 @@ def run(args: argparse.Namespace) -> int:
     import os
     import signal
 
+    import worker.supervise  # noqa: F401 (here once, or every job's forked child would import it anew)
     from worker.hand import WorkLoop
     from worker.lifeline import die_with_parent
     from worker.settings import WorkerSettings

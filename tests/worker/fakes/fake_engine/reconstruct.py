@@ -18,7 +18,7 @@ def reconstruct(plan: dict[str, Any], options: Options, keeper: Keeper) -> Gener
     about = {"format": "splatct-checkpoint", "version": 1, "software": "fake", "scan": plan, "options": {}}
     state, word = keeper.recall(lambda: about, ())
     first = 0 if state is None else state["step"]
-    yield Progress("read", 0.0, word or "Reading")
+    yield Progress("start", 0.0, word or "At work")
     steps = plan.get("steps", 3)
     if plan.get("deaf"):
         signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -1,5 +1,5 @@
 """The service under test: Valkey, the server and workers as processes in a folder of their own, started again a second
-after they died, as `splatct up` does. The engine is the real one, slowed by test mode."""
+after they died, as `splatct up` does."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -24,9 +26,6 @@ from server.redisserver import OwnRedis
 from splatcore.simulate import Simulation, simulate
 
 _AGAIN_S = 1.0  # after a death
-CHECKPOINT_S = 1.0
-_STEP_S = 0.004
-_OPTIONS = {"quality": "preview", "calibrate": "full", "splats": 1500, "threads": 1}
 
 
 class Part:
@@ -67,45 +66,57 @@ class Part:
 class Service:
     """Use it in `with`; call `tend` often."""
 
-    def __init__(self, folder: Path, workers: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        workers: int,
+        settings: Mapping[str, object] | None = None,
+        imports: Sequence[Path] = (),
+        server: str = "server",
+    ) -> None:
+        """`settings` are SPLATCT_* variables by the rest of their names; `imports` are added to PYTHONPATH, `server` is
+        the module that serves."""
         self.data, self.log = folder / "data", folder / "log.txt"
         self.data.mkdir(parents=True)
         self.redis = OwnRedis(folder / "redis")
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
-            self._port = probe.getsockname()[1]
+            self.port = probe.getsockname()[1]
+        paths = [str(Path.cwd()), *map(str, imports), os.environ.get("PYTHONPATH", "")]
         environment = {k: v for k, v in os.environ.items() if not k.startswith("SPLATCT_")} | {
-            "PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), os.environ.get("PYTHONPATH", "")])),
+            "PYTHONPATH": os.pathsep.join(filter(None, paths)),
             "SPLATCT_DATA": str(self.data),
             "SPLATCT_REDIS_URL": self.redis.url,
-            "SPLATCT_PORT": str(self._port),
-            "SPLATCT_CHECKPOINT_S": str(CHECKPOINT_S),
-            "SPLATCT_TEST_MODE": "1",
-            "SPLATCT_TEST_STEP_S": str(_STEP_S),
+            "SPLATCT_PORT": str(self.port),
+            **{f"SPLATCT_{name.upper()}": str(value) for name, value in (settings or {}).items()},
         }
-        self.server = Part("server", environment, self.log)
+        self.server = Part(server, environment, self.log)
         self.workers = [Part("worker", environment, self.log) for _ in range(workers)]
-        self.url = f"http://127.0.0.1:{self._port}"
-        self._client = Client(self.url)
-        self._scan = ""
+        self.url = f"http://127.0.0.1:{self.port}"
+        self.client = Client(self.url)
 
     def __enter__(self) -> Self:
         self.redis.start()
         self.tend()
         self.until(lambda: self.jobs() is not None, 60, "the server answers")
-        folder = self.data.parent / "scan"
-        z, y, x = np.mgrid[-1:1:24j, -1:1:24j, -1:1:24j]
-        body = 0.5 * (x**2 + (y / 0.7) ** 2 + (z / 0.8) ** 2 < 0.6) + 0.4 * (abs(x + 0.3) + abs(y) + abs(z) < 0.25)
-        what = Simulation(views=16, det=48, sigma_rot=0.02, sigma_trans=1.0, seed=1)
-        simulate(body.astype(np.float32), folder, what, threads=1, name="faults")
-        self._scan = send(self._client, read_scan_folder(folder))
         return self
+
+    def send_body(self, edge: int, what: Simulation) -> str:
+        """The id of a small scan: a body with an insert, `edge` voxels a side, simulated and committed."""
+        folder = self.data.parent / "scan"
+        z, y, x = np.mgrid[-1 : 1 : edge * 1j, -1 : 1 : edge * 1j, -1 : 1 : edge * 1j]
+        body = 0.5 * (x**2 + (y / 0.7) ** 2 + (z / 0.8) ** 2 < 0.6) + 0.4 * (abs(x + 0.3) + abs(y) + abs(z) < 0.25)
+        simulate(body.astype(np.float32), folder, what, threads=1, name="body")
+        return self.send(folder)
+
+    def send(self, folder: Path) -> str:
+        return send(self.client, read_scan_folder(folder))
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         for part in (*self.workers, self.server):
             part.stop()
         self.redis.stop()
-        self._client.__exit__(None, None, None)
+        self.client.__exit__(None, None, None)
 
     def tend(self) -> None:
         """Start again what has died."""
@@ -114,19 +125,16 @@ class Service:
         for part in (self.server, *self.workers):
             part.tend()
 
-    def submit(self, seed: int) -> str:
-        return self._client.submit(self._scan, {**_OPTIONS, "seed": seed}).id
-
     def jobs(self) -> dict[str, dict[str, Any]] | None:
         """All jobs as the server tells them; None while it does not answer."""
         try:
-            answer = httpx.get(f"http://127.0.0.1:{self._port}/v1/jobs?limit=500", timeout=5, trust_env=False)
+            answer = httpx.get(f"{self.url}/v1/jobs?limit=500", timeout=5, trust_env=False)
             return {job["id"]: job for job in answer.raise_for_status().json()["jobs"]}
         except httpx.HTTPError:
             return None
 
     def events(self, job_id: str) -> list[dict[str, Any]]:
-        path = f"http://127.0.0.1:{self._port}/v1/jobs/{job_id}/events"
+        path = f"{self.url}/v1/jobs/{job_id}/events"
         return list(httpx.get(path, timeout=10, trust_env=False).raise_for_status().json()["events"])
 
     def engines(self) -> dict[str, int]:
@@ -156,6 +164,18 @@ class Service:
                 raise TimeoutError(f"waited {seconds:.0f} s until {what}; the service's log is {self.log}")
             self.tend()
             time.sleep(0.1)
+
+
+@contextlib.contextmanager
+def in_passing(
+    workers: int, settings: Mapping[str, object] | None = None, imports: Sequence[Path] = (), server: str = "server"
+) -> Iterator[Service]:
+    """A service in a temporary folder."""
+    with (
+        tempfile.TemporaryDirectory(prefix="splatct-bench-", ignore_cleanup_errors=True) as folder,
+        Service(Path(folder), workers, settings, imports, server) as service,
+    ):
+        yield service
 
 
 def _parent(pid: int) -> int:
