@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from uuid import UUID
 
 from fastapi import APIRouter, Header, Query, Response
-from fastapi.responses import FileResponse, PlainTextResponse
+from fastapi.responses import PlainTextResponse, StreamingResponse
 
 from server import costs
 from server.answers import job_out, retry_after
@@ -18,6 +18,7 @@ from splatcore.options import describe
 from worker.contract import State
 from worker.journal import read_events
 from worker.ledger import Job
+from worker.redaction import Redaction
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
@@ -103,11 +104,15 @@ def get_events(job_id: UUID, service: Served, after: Annotated[int, Query(ge=0)]
 
 
 @router.get("/jobs/{job_id}/log", response_class=PlainTextResponse)
-def get_log(job_id: UUID, service: Served) -> Response:
-    log = service.folder(service.job(job_id).id).log
-    if not log.exists():
-        return PlainTextResponse("")
-    return FileResponse(log, media_type="text/plain")
+def get_log(
+    job_id: UUID,
+    service: Served,
+    last: Annotated[int | None, Query(ge=1, le=1 << 30, description="bytes: no more than these, whole lines")] = None,
+) -> Response:
+    """What the engine said, without the places where things lie on the server."""
+    folder = service.folder(service.job(job_id).id)
+    redacted = Redaction(service.settings.data, folder.path)
+    return StreamingResponse(redacted.log(folder.log, last), media_type="text/plain")
 
 
 def _submitted(service: Service, response: Response, job: Job, replayed: bool) -> JobOut:

@@ -23,6 +23,8 @@ from worker.lifeline import host_id
 
 log = logging.getLogger("splatct.server")
 
+MEASURED_AT_ONCE = 500  # jobs of one sweep: after an upgrade there may be many
+
 
 class Reconciler:
     def __init__(self, ledger: Ledger, dispatcher: Dispatcher, data: Path, clock: Callable[[], float] = time.monotonic):
@@ -43,6 +45,7 @@ class Reconciler:
         for job in working:
             self._revive(job)
         self._dispatch([job for job in active if job.state is State.QUEUED])
+        self._measure()
 
     def _revive(self, job: Job) -> None:
         """Settle the job if its worker is dead."""
@@ -70,9 +73,15 @@ class Reconciler:
         elif folder.published():
             self._ledger.succeed(job.id, job.attempt)
         else:
-            end = self._ledger.crashed(job, "The worker died", folder.advanced(), folder.log_tail())
+            end = self._ledger.crashed(job, "The worker died", folder.advanced())
             if end is State.FAILED:
                 folder.tidy()
+
+    def _measure(self) -> None:
+        """Note what jobs that have ended left, for the quotas; until then they count as estimated."""
+        ended = self._ledger.unmeasured(MEASURED_AT_ONCE)
+        if ended:
+            self._ledger.measured({job_id: JobFolder(self._data, job_id).kept_bytes() for job_id in ended})
 
     def _end_lost(self, job: Job, message: str) -> None:
         if job.state is State.CANCELLING:

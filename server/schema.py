@@ -242,8 +242,9 @@ class Taken(BaseModel):
 
 
 class Usage(BaseModel):
-    bytes: Taken = Field(description="announced by open uploads, and of scans")
+    bytes: Taken = Field(description="announced by open uploads, of scans, and of jobs: estimated until they end")
     active_jobs: Taken = Field(description="queued or running")
+    open_uploads: Taken = Field(description="not yet committed")
 
 
 class Readiness(BaseModel):
