@@ -11,7 +11,7 @@ from fastapi.responses import PlainTextResponse, StreamingResponse
 from server import costs
 from server.answers import job_out, retry_after
 from server.problems import ApiProblem, not_found
-from server.schema import EstimateOut, EventList, JobIn, JobList, JobOut, RestartIn
+from server.schema import PRIORITIES, EstimateOut, EventList, JobChangeIn, JobIn, JobList, JobOut, RestartIn
 from server.service import Served, Service
 from server.submit import restart, submit, submit_as, validate
 from splatcore.options import describe
@@ -64,6 +64,15 @@ def list_jobs(
     more = len(jobs) > limit
     jobs = jobs[:limit]
     return JobList(jobs=[job_out(service, job) for job in jobs], next=jobs[-1].id if more else None)
+
+
+@router.patch("/jobs/{job_id}")
+def change_job(job_id: UUID, body: JobChangeIn, service: Served) -> JobOut:
+    """Another place in the queue: the one thing of a job that can be changed after it was submitted."""
+    job = service.job(job_id)
+    if not service.store.jobs.prioritise(job.id, PRIORITIES[body.priority]):
+        raise ApiProblem(409, "finished", f"The job is {job.state}: its place in the queue matters no more.")
+    return job_out(service, service.job(job_id))
 
 
 @router.post("/jobs/{job_id}/cancel", status_code=202)

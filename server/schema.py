@@ -65,6 +65,10 @@ class RestartIn(Body):
     priority: PriorityName | None = Field(default=None, description="default: that of the earlier job")
 
 
+class JobChangeIn(Body):
+    priority: PriorityName
+
+
 class EstimateOut(BaseModel):
     """What a job would cost; nothing was run."""
 

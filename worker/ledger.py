@@ -267,6 +267,12 @@ class Ledger:
         with self._database.writing() as write:
             return write.execute(jobs.update().where(mine).values(pinned=pinned)).rowcount == 1
 
+    def prioritise(self, job_id: str, priority: Priority) -> bool:
+        """Give a job another place in its tenant's queue, the next time it waits; False if it has finished."""
+        mine = sa.and_(jobs.c.id == job_id, self._mine(), jobs.c.state.in_(list(ACTIVE)))
+        with self._database.writing() as write:
+            return write.execute(jobs.update().where(mine).values(priority=int(priority))).rowcount == 1
+
     def unmeasured(self, most: int) -> list[str]:
         """Jobs that have ended, and of which nobody has measured yet what is left."""
         query = sa.select(jobs.c.id).where(jobs.c.measured == sa.false(), jobs.c.state.in_(list(FINISHED))).limit(most)
