@@ -102,6 +102,7 @@ def scanner(stack: Stack, tmp_path: Path) -> Scanner:
     return Scanner(stack, tmp_path / "pc")
 
 
+@pytest.mark.slow
 def test_many_small_files(scanner: Scanner) -> None:
     """Each is sent whole: of what was sent when the client died, one at most is sent again."""
     names = [f"{view:03}.tif" for view in range(120)]
