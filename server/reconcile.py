@@ -15,8 +15,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from sqlalchemy.exc import DBAPIError
+
 from server.dispatch import Dispatcher, RedisError
 from worker.contract import DEAD_S, STUCK_S, ErrorKind, State
+from worker.fulldisk import is_full
 from worker.jobfolder import JobFolder
 from worker.ledger import Job, Ledger
 from worker.lifeline import host_id
@@ -80,8 +83,14 @@ class Reconciler:
     def _measure(self) -> None:
         """Note what jobs that have ended left, for the quotas; until then they count as estimated."""
         ended = self._ledger.unmeasured(MEASURED_AT_ONCE)
-        if ended:
+        if not ended:
+            return
+        try:
             self._ledger.measured({job_id: JobFolder(self._data, job_id).kept_bytes() for job_id in ended})
+        except DBAPIError as error:
+            if not is_full(error):
+                raise
+            log.debug("the disk is full: %d jobs are measured when there is room again", len(ended))
 
     def _end_lost(self, job: Job, message: str) -> None:
         if job.state is State.CANCELLING:

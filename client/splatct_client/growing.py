@@ -10,14 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from splatct_client.client import Client
-from splatct_client.errors import InputError
+from splatct_client.errors import InputError, ServerProblem
 from splatct_client.journal import Journal
 from splatct_client.models import FileSpec, Upload
 from splatct_client.scanfolder import ScanFolder, read_scan_folder, spec_of
-from splatct_client.sending import commit, earlier, given_up_if_refused, send_files
+from splatct_client.sending import abandon, commit, earlier, given_up_if_refused, send_files
 
 POLL_S = 0.5
 TIFF = (".tif", ".tiff")
+ANNOUNCED = "urn:splatct:problem:announced"  # with another size or digest
 
 
 @dataclass
@@ -78,7 +79,7 @@ class GrowingScan:
 
 def send_growing(client: Client, scan: GrowingScan, name: str, journal: Journal, idle_s: float | None) -> str:
     """Until the scan is whole; then commits it and returns its id. Raises InputError when nothing has come for
-    `idle_s`: another run goes on."""
+    `idle_s`: another run goes on; and for a file that changed after it was sent: another run begins anew."""
     upload = _opened(client, name, journal)
     sent = {file.name: file.size for file in upload.files if file.complete}
     if sent:
@@ -88,11 +89,11 @@ def send_growing(client: Client, scan: GrowingScan, name: str, journal: Journal,
         while upload.state != "committed":
             whole = scan.whole()
             if whole is not None:
-                _send_rest(client, upload.id, whole)
+                _send_rest(client, upload.id, whole, journal)
                 break
             for file, path in scan.views().items():
                 if sent.get(file) != path.stat().st_size:
-                    sent[file] = _send(client, upload.id, spec_of(file, path), path)
+                    sent[file] = _send(client, upload.id, spec_of(file, path), path, journal)
                     came = client.patience.clock()
             if idle_s is not None and client.patience.clock() - came > idle_s:
                 raise InputError(
@@ -103,17 +104,27 @@ def send_growing(client: Client, scan: GrowingScan, name: str, journal: Journal,
         return commit(client, upload.id)
 
 
-def _send_rest(client: Client, upload_id: str, scan: ScanFolder) -> None:
+def _send_rest(client: Client, upload_id: str, scan: ScanFolder, journal: Journal) -> None:
     """What of the whole scan is not at the server, scan.json last. All is read once more: a view that was written again
     after it was sent is told by its digest, and refused."""
     there = {file.name: file.sha256 for file in client.upload(upload_id).files}
     for spec in (*scan.specs[1:], scan.json_spec()):
         if there.get(spec.name) != spec.sha256:
-            _send(client, upload_id, spec, scan.sources[spec.name])
+            _send(client, upload_id, spec, scan.sources[spec.name], journal)
 
 
-def _send(client: Client, upload_id: str, spec: FileSpec, source: Path | bytes) -> int:
-    (told,) = client.announce(upload_id, [spec])
+def _send(client: Client, upload_id: str, spec: FileSpec, source: Path | bytes, journal: Journal) -> int:
+    try:
+        (told,) = client.announce(upload_id, [spec])
+    except ServerProblem as problem:
+        if problem.kind != ANNOUNCED:
+            raise
+        abandon(client, upload_id)  # what is announced cannot be changed: this upload will never be whole
+        journal.forget()
+        raise InputError(
+            f"{spec.name} was written again after it was sent, so what was sent is given up. Start again, with a "
+            "longer --settle if the scanner pauses while it writes a file"
+        ) from None
     if not told.complete:  # the server may have the same bytes from another scan
         send_files(client, upload_id, {spec.name: source})
     return spec.size

@@ -55,13 +55,13 @@ def given_up_if_refused(client: Client, upload_id: str, journal: Journal | None)
         yield
     except ServerProblem as problem:
         if problem.status == 422 or journal is None:
-            _abandon(client, upload_id)
+            abandon(client, upload_id)
             if journal is not None:
                 journal.forget()
         raise
     except KeyboardInterrupt:
         if journal is None:
-            _abandon(client, upload_id)
+            abandon(client, upload_id)
         else:
             print("the same command goes on from here", file=sys.stderr)
         raise
@@ -116,14 +116,14 @@ def _opened(client: Client, name: str, specs: Sequence[FileSpec], journal: Journ
         if journal.get("files") == files:
             return found
         if found.state != "committed":
-            _abandon(client, found.id)  # of other files: the scan was changed since
+            abandon(client, found.id)  # of other files: the scan was changed since
     upload = client.create_upload(name, specs)
     if journal is not None:
         journal.note(upload=upload.id, files=files)
     return upload
 
 
-def _abandon(client: Client, upload_id: str) -> None:
+def abandon(client: Client, upload_id: str) -> None:
     with contextlib.suppress(ClientError):
         client.abandon(upload_id)  # or it would hold its share of the server's disk until it expires
 

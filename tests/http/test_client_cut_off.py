@@ -181,12 +181,14 @@ def test_where_no_state_can_be_kept_it_is_sent_all_the_same(scanner: Scanner) ->
 
 def test_views_are_sent_while_the_scanner_writes(scanner: Scanner) -> None:
     """The client is killed in the middle, and scan.json comes last."""
-    views = 16
+    views, killed = 16, threading.Event()
 
     def scan() -> None:
         for view in range(views):
+            if view == views // 2:
+                killed.wait(120)
             scanner.write(f"{view:03}.tif", np.full((16, 16), view, "float32"))
-            time.sleep(0.3)
+            time.sleep(0.1)
         scanner.describe([f"{view:03}.tif" for view in range(views)], views, 16)
 
     turning = threading.Thread(target=scan)
@@ -194,9 +196,10 @@ def test_views_are_sent_while_the_scanner_writes(scanner: Scanner) -> None:
     process = scanner.start("send", str(scanner.folder), "--settle", "0.3")
     one = scanner.stack.data / "uploads"
     scanner.stack.until(lambda: len(list(one.glob("*/scan/*.tif"))) >= 4, 60, "four views have come")
-    assert turning.is_alive() and not (scanner.folder / "scan.json").exists()
     process.kill()
     process.communicate()
+    assert not (scanner.folder / "scan.json").exists()
+    killed.set()
     job = scanner.run("send", str(scanner.folder), "--settle", "0.3", "--name", "Prüfling 9")["job"]
     turning.join()
     names = [f"{view:03}.tif" for view in range(views)]
@@ -225,6 +228,23 @@ def test_a_view_that_is_still_written_waits(scanner: Scanner) -> None:
     assert scanner.received() == len(pixels) + len(
         (scanner.stack.data / "scans" / scan_id / "scan.json").read_bytes()
     ), "no byte of a file that was not finished"
+
+
+def test_a_view_that_changes_after_it_was_sent_is_told(scanner: Scanner) -> None:
+    """The size is that of before; the digest tells. Another run sends what is there now."""
+    scanner.write("000.tif", np.zeros((16, 16), "float32"))
+    process = scanner.start("send", str(scanner.folder), "--settle", "0.1")
+    uploads = scanner.stack.data / "uploads"
+    scanner.stack.until(lambda: bool(list(uploads.glob("*/scan/000.tif"))), 60, "it is sent")
+    scanner.write("000.tif", np.ones((16, 16), "float32"))
+    scanner.describe(["000.tif"], 1, 16)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2 and "000.tif was written again after it was sent" in err
+    assert not scanner.uploads(), "what will never be whole holds no room"
+    again = scanner.start("send", str(scanner.folder), "--settle", "0.1")
+    again.communicate(timeout=60)
+    (folder,) = (scanner.stack.data / "scans").iterdir()
+    assert scanner.committed(folder.name)["000.tif"] == scanner.digest("000.tif")
 
 
 def test_a_folder_where_nothing_comes_is_given_up(scanner: Scanner) -> None:
