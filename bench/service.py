@@ -20,7 +20,7 @@ import httpx
 import numpy as np
 from splatct_client.client import Client
 from splatct_client.scanfolder import read_scan_folder
-from splatct_client.verbs.submit import send
+from splatct_client.sending import send
 
 from server.redisserver import OwnRedis
 from splatcore.simulate import Simulation, simulate

@@ -43,7 +43,7 @@ def open_upload(service: Service, name: str, files: list[File]) -> Upload:
     known = find(service.store, files)
     _require_room(service, [file for file in files if file.name not in known])
     size = sum(file.size for file in files)
-    upload = service.store.add_upload(name, files, service.quotas.room_for(service.tenant, size))
+    upload = service.store.add_upload(name, files, service.quotas.upload(service.tenant, size))
     try:
         service.intake.create(upload.id)
         _adopt(service, upload.id, files, known)
@@ -77,7 +77,7 @@ def add_files(service: Service, upload_id: str, files: list[File]) -> list[File]
             raise invalid("The upload has too many files.", [Problem("files", what, "put several views in one TIFF")])
         return new
 
-    new = service.store.add_files(upload_id, judge, lambda size: service.quotas.room_for(service.tenant, size))
+    new = service.store.add_files(upload_id, judge, lambda size: service.quotas.files(service.tenant, size))
     if new is None:
         raise ApiProblem(409, "committed", "The upload is committed; its files can no longer change.")
     _adopt(service, upload_id, new, known)

@@ -36,6 +36,7 @@ from server.census import Census, Outcomes
 from server.deliveries import Outbox, keep_delivering
 from server.dispatch import Dispatcher
 from server.guard import Guard
+from server.health import Pulse
 from server.importing import roots
 from server.intake import Intake
 from server.janitor import Janitor, keep_clean
@@ -83,7 +84,7 @@ def create_app(settings: Settings) -> FastAPI:
         watch = Watch(store.jobs, settings.data)
         reconciler = Reconciler(store.jobs, dispatcher, settings.data)
         outcomes, outbox = Outcomes(database), Outbox(database, settings.webhook_retry_s)
-        quotas = Quotas(round(settings.tenant_gib * (1 << 30)), settings.tenant_jobs)
+        quotas = Quotas.from_settings(settings)
         reserve = Reserve(settings.data, settings.disk_reserve_mib * MIB)
         reserve.fill()
         import_roots = roots(settings.import_from, settings.data)
@@ -94,14 +95,16 @@ def create_app(settings: Settings) -> FastAPI:
 
         app.state.service = Service(settings, store, intake, watch, outcomes, quotas, reserve, wake_up, import_roots)
         app.state.metrics = Metrics(JobNumbers(Census(database), outcomes, reconciler, settings.data))
-        app.state.dispatcher = dispatcher
+        app.state.pulse = Pulse(database, dispatcher, settings)
         app.state.audit = AuditLog(database)
         app.state.rates = Rates(
             Buckets(settings.rate_per_s, settings.rate_burst),
             Buckets(settings.failures_per_min / 60, max(1, round(settings.failures_per_min))),
         )
         app.state.keys = KeyRing(database)
-        app.state.sessions = Sessions(database, app.state.keys, round(settings.session_hours * 3600))
+        app.state.sessions = Sessions(
+            database, app.state.keys, round(settings.session_hours * 3600), settings.key_sessions
+        )
         tasks = [
             asyncio.create_task(keep_reconciling(reconciler, settings.reconcile_s, wake)),
             asyncio.create_task(watch.keep_looking()),

@@ -65,10 +65,11 @@ async def stream_events(
     eye: Annotated[Eye, Depends(_following)],
     service: Served,
     after: Annotated[int, Query(ge=0)] = 0,
+    job: Annotated[bool, Query(description="tell, too, whenever the job itself changes: `event: job`")] = False,
     last_event_id: Annotated[int | None, Header(ge=0)] = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """Events numbered above `Last-Event-ID` (or `after`) as they come; `end`, with the job, is the last."""
-    async for event in stream.follow(service, eye, after if last_event_id is None else last_event_id):
+    async for event in stream.follow(service, eye, after if last_event_id is None else last_event_id, job):
         yield event
 
 

@@ -6,18 +6,19 @@ from typing import Annotated, Any
 from uuid import UUID
 
 from fastapi import APIRouter, Header, Query, Response
-from fastapi.responses import FileResponse, PlainTextResponse
+from fastapi.responses import PlainTextResponse, StreamingResponse
 
 from server import costs
 from server.answers import job_out, jobs_out, retry_after
 from server.problems import ApiProblem, not_found
-from server.schema import EstimateOut, EventList, JobIn, JobList, JobOut, RestartIn
+from server.schema import PRIORITIES, EstimateOut, EventList, JobChangeIn, JobIn, JobList, JobOut, RestartIn
 from server.service import Served, Service
 from server.submit import restart, submit, submit_as, validate
 from splatcore.options import describe
 from worker.contract import State
 from worker.journal import read_events
 from worker.ledger import Job
+from worker.redaction import Redaction
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
@@ -66,6 +67,15 @@ def list_jobs(
     return Response(listed.model_dump_json(), media_type="application/json")  # as it is: fifty need no second check
 
 
+@router.patch("/jobs/{job_id}")
+def change_job(job_id: UUID, body: JobChangeIn, service: Served) -> JobOut:
+    """Another place in the queue: the one thing of a job that can be changed after it was submitted."""
+    job = service.job(job_id)
+    if not service.store.jobs.prioritise(job.id, PRIORITIES[body.priority]):
+        raise ApiProblem(409, "finished", f"The job is {job.state}: its place in the queue matters no more.")
+    return job_out(service, service.job(job_id))
+
+
 @router.post("/jobs/{job_id}/cancel", status_code=202)
 def cancel_job(job_id: UUID, service: Served, response: Response) -> JobOut:
     job = service.store.jobs.ask_cancel(str(job_id))
@@ -104,11 +114,15 @@ def get_events(job_id: UUID, service: Served, after: Annotated[int, Query(ge=0)]
 
 
 @router.get("/jobs/{job_id}/log", response_class=PlainTextResponse)
-def get_log(job_id: UUID, service: Served) -> Response:
-    log = service.folder(service.job(job_id).id).log
-    if not log.exists():
-        return PlainTextResponse("")
-    return FileResponse(log, media_type="text/plain")
+def get_log(
+    job_id: UUID,
+    service: Served,
+    last: Annotated[int | None, Query(ge=1, le=1 << 30, description="bytes: no more than these, whole lines")] = None,
+) -> Response:
+    """What the engine said, without the places where things lie on the server."""
+    folder = service.folder(service.job(job_id).id)
+    redacted = Redaction(service.settings.data, folder.path)
+    return StreamingResponse(redacted.log(folder.log, last), media_type="text/plain")
 
 
 def _submitted(service: Service, response: Response, job: Job, replayed: bool) -> JobOut:

@@ -15,13 +15,18 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from sqlalchemy.exc import DBAPIError
+
 from server.dispatch import Dispatcher, RedisError
 from worker.contract import DEAD_S, STUCK_S, ErrorKind, State
+from worker.fulldisk import is_full
 from worker.jobfolder import JobFolder
 from worker.ledger import Job, Ledger
 from worker.lifeline import host_id
 
 log = logging.getLogger("splatct.server")
+
+MEASURED_AT_ONCE = 500  # jobs of one sweep: after an upgrade there may be many
 
 
 class Reconciler:
@@ -43,6 +48,7 @@ class Reconciler:
         for job in working:
             self._revive(job)
         self._dispatch([job for job in active if job.state is State.QUEUED])
+        self._measure()
 
     def _revive(self, job: Job) -> None:
         """Settle the job if its worker is dead."""
@@ -70,9 +76,21 @@ class Reconciler:
         elif folder.published():
             self._ledger.succeed(job.id, job.attempt)
         else:
-            end = self._ledger.crashed(job, "The worker died", folder.advanced(), folder.log_tail())
+            end = self._ledger.crashed(job, "The worker died", folder.advanced())
             if end is State.FAILED:
                 folder.tidy()
+
+    def _measure(self) -> None:
+        """Note what jobs that have ended left, for the quotas; until then they count as estimated."""
+        ended = self._ledger.unmeasured(MEASURED_AT_ONCE)
+        if not ended:
+            return
+        try:
+            self._ledger.measured({job_id: JobFolder(self._data, job_id).kept_bytes() for job_id in ended})
+        except DBAPIError as error:
+            if not is_full(error):
+                raise
+            log.debug("the disk is full: %d jobs are measured when there is room again", len(ended))
 
     def _end_lost(self, job: Job, message: str) -> None:
         if job.state is State.CANCELLING:

@@ -65,6 +65,10 @@ class RestartIn(Body):
     priority: PriorityName | None = Field(default=None, description="default: that of the earlier job")
 
 
+class JobChangeIn(Body):
+    priority: PriorityName
+
+
 class EstimateOut(BaseModel):
     """What a job would cost; nothing was run."""
 
@@ -242,8 +246,9 @@ class Taken(BaseModel):
 
 
 class Usage(BaseModel):
-    bytes: Taken = Field(description="announced by open uploads, and of scans")
+    bytes: Taken = Field(description="announced by open uploads, of scans, and of jobs: estimated until they end")
     active_jobs: Taken = Field(description="queued or running")
+    open_uploads: Taken = Field(description="not yet committed")
 
 
 class Readiness(BaseModel):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import sqlalchemy as sa
 
 from server.keys import Key, KeyRing
-from worker.database import Database, metadata
+from worker.database import Database, alone, metadata
 
 CSRF_HEADER = "X-CSRF-Token"
 
@@ -34,19 +34,34 @@ class Session:
     expires_at: float
 
 
+class TooMany(Exception):
+    """The key has as many sessions as it may have."""
+
+    def __init__(self, most: int, wait_s: float) -> None:
+        super().__init__(f"{most} sessions were begun with this key and have not ended; no more may be")
+        self.wait_s = wait_s  # until the first of them ends by itself
+
+
 class Sessions:
-    def __init__(self, database: Database, ring: KeyRing, last_s: int) -> None:
+    def __init__(self, database: Database, ring: KeyRing, last_s: int, most: int = 0) -> None:
+        """most: sessions of one key at a time; 0: no limit."""
         self._database = database
         self._ring = ring
+        self._most = most
         self.last_s = last_s
 
     def begin(self, key: Key) -> tuple[Session, str]:
-        """A session, and the token for its cookie. It ends with the key at the latest."""
+        """A session, and the token for its cookie. It ends with the key at the latest. Raises TooMany."""
         token, now = secrets.token_urlsafe(32), time.time()
         ends = min(now + self.last_s, key.expires_at or float("inf"))
         row = {"digest": _digest(token), "key_id": key.id, "created_at": now, "expires_at": ends}
         with self._database.writing() as write:
             write.execute(sessions.delete().where(sessions.c.expires_at <= now))
+            alone(write, key.id)
+            query = sa.select(sa.func.count(), sa.func.min(sessions.c.expires_at)).where(sessions.c.key_id == key.id)
+            count, first_end = write.execute(query).one()
+            if self._most and count >= self._most:
+                raise TooMany(self._most, first_end - now)
             write.execute(sessions.insert().values(**row))
         return Session(key, ends), token
 

@@ -27,8 +27,10 @@ class Settings(WorkerSettings):
     disk_floor_mib: int = 512  # kept free: no upload may take the last of the disk
     disk_reserve_mib: int = Field(default=8, ge=0)  # held by a file, so that a full disk still lets things be deleted
     import_from: str = ""  # folders of this machine that tenants may import scans from: TENANT=FOLDER, comma between
-    tenant_gib: float = Field(default=0.0, ge=0)  # of uploads and scans that one tenant may keep; 0: no limit
+    tenant_gib: float = Field(default=0.0, ge=0)  # of uploads, scans and results that a tenant may keep; 0: no limit
     tenant_jobs: int = Field(default=0, ge=0)  # of one tenant that may wait and run together; 0: no limit
+    tenant_uploads: int = Field(default=1000, ge=0)  # of one tenant that may be open together; 0: no limit
+    key_sessions: int = Field(default=50, ge=0)  # of the page, signed in with one key; 0: no limit
     rate_per_s: float = Field(default=50.0, ge=0)  # requests of one key, on the long run; 0: no limit
     rate_burst: int = Field(default=200, ge=1)  # and at once
     failures_per_min: float = Field(default=10.0, ge=0)  # keys from one address that are none; 0: no limit

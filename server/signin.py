@@ -12,7 +12,8 @@ from server.problems import ApiProblem
 from server.rates import Rates, neighbourhood
 from server.schema import SessionIn, SessionOut, moment
 from server.service import Served
-from server.sessions import Sessions, cookie_name, csrf_token
+from server.sessions import Sessions, TooMany, cookie_name, csrf_token
+from splatcore.errors import Problem
 
 router = APIRouter(prefix="/v1/session", tags=["session"])
 
@@ -34,7 +35,12 @@ def sign_in(body: SessionIn, request: Request, response: Response) -> SessionOut
     if key is None:
         rates.failures.take(address)
         raise ApiProblem(401, "unauthorized", "This key is not known here, has expired or was revoked.")
-    session, token = sessions.begin(key)
+    try:
+        session, token = sessions.begin(key)
+    except TooMany as many:
+        fault = Problem("sessions", str(many), "sign out where it is no longer needed, or use another key")
+        detail = "Too many browsers are signed in with this key."
+        raise ApiProblem(429, "too-many-sessions", detail, [fault], math.ceil(many.wait_s)) from None
     request.state.caller = caller = Caller.of(key, session.expires_at)
     response.set_cookie(
         cookie_name(request.url.scheme),

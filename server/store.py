@@ -115,6 +115,7 @@ class NewJob:
     claim: Claim | None = None
     priority: Priority = Priority.NORMAL
     restart_of: str | None = None
+    bytes: int = 0  # that it may come to
 
 
 Permit = Callable[[sa.Connection], None]
@@ -303,7 +304,7 @@ class Store:
             permit(write)
             write.execute(scans.update().where(mine).values(used_at=time.time()))
             named = (scan.id, scan.name)
-            self.jobs.add(write, job.id, job.name, named, job.options, job.priority, job.restart_of)
+            self.jobs.add(write, job.id, job.name, named, job.options, job.priority, job.restart_of, job.bytes)
             if job.claim is not None:
                 self.submissions.add(write, job.claim, job.id)
             place()

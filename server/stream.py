@@ -16,12 +16,13 @@ from worker.journal import Cursor
 _AT_ONCE = 500
 
 
-async def follow(service: Service, eye: Eye, after: int) -> AsyncIterator[ServerSentEvent]:
-    """Events numbered above `after`, and `end` when the job has finished and all were given.
+async def follow(service: Service, eye: Eye, after: int, rows: bool) -> AsyncIterator[ServerSentEvent]:
+    """Events numbered above `after`, and `end` when the job has finished and all were given. With `rows` also the job,
+    as `job`, whenever it has changed; these have no number, and the first says how it is now.
 
     Ends without `end` when the server stops; the reader comes back with the last id that it saw.
     """
-    cursor, last = Cursor(service.folder(eye.job_id).events), after
+    cursor, last, told = Cursor(service.folder(eye.job_id).events), after, None
     while (sight := await eye.news()) is not None:
         while (lines := eye.tail.since(last)) != []:
             if lines is None:
@@ -35,3 +36,6 @@ async def follow(service: Service, eye: Eye, after: int) -> AsyncIterator[Server
             data = None if sight.job is None else JobOut.of(sight.job, sight.queue_position)
             yield ServerSentEvent(event="end", data=data or {}, id=str(last) if last else None)
             return
+        if rows and (now := JobOut.of(sight.job, sight.queue_position)) != told:
+            told = now
+            yield ServerSentEvent(event="job", data=now)

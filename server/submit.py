@@ -8,6 +8,7 @@ from uuid import UUID, uuid4
 
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
+from server.costs import found
 from server.problems import ApiProblem, invalid, not_found
 from server.schema import PRIORITIES, JobIn, RestartIn, priority_name
 from server.service import Service
@@ -64,7 +65,8 @@ def _submit(
         return _repeated(service, claim, earlier), True
     scan, options = validate(service, body)
     source = None if restarted is None else restarted.id
-    job = NewJob(job_id, body.name or scan.name, options.to_dict(), claim, PRIORITIES[body.priority], source)
+    size = found(scan, options).disk_bytes
+    job = NewJob(job_id, body.name or scan.name, options.to_dict(), claim, PRIORITIES[body.priority], source, size)
     try:
         _queue(service, scan, job)
     except IntegrityError:
@@ -89,7 +91,7 @@ def _queue(service: Service, scan: Scan, job: NewJob) -> None:
         made.create(service.intake.scan_folder(scan.id))
         if job.restart_of is not None:
             made.go_on_from(service.folder(job.restart_of))
-        queued = service.store.add_job(job, scan, place, service.quotas.place_for(service.tenant))
+        queued = service.store.add_job(job, scan, place, service.quotas.job(service.tenant, job.bytes))
     except FileNotFoundError:
         queued = False
     except DBAPIError as error:

@@ -168,4 +168,5 @@ def _shown(sight: Sight) -> object:
     job = sight.job
     if job is None:
         return None
-    return job.state, job.attempt, job.stage, job.message, job.progress, job.eta_s, job.pinned, sight.queue_position
+    told = (job.state, job.attempt, job.stage, job.message, job.progress, job.eta_s, job.pinned, job.priority)
+    return *told, sight.queue_position

@@ -14,10 +14,10 @@ from fastapi import APIRouter, Response
 
 from server.deliveries import SECRET_PREFIX
 from server.problems import ApiProblem, invalid, not_found
-from server.quotas import alone
 from server.schema import DeliveryList, DeliveryOut, WebhookIn, WebhookList, WebhookOut, moment
 from server.service import Served, Service
 from splatcore.errors import Problem
+from worker.database import alone
 from worker.outbox import deliveries, webhooks
 
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])

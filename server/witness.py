@@ -35,6 +35,7 @@ ACTIONS = {
     ("PUT", "/v1/jobs/{job_id}"): "submit",
     ("POST", "/v1/jobs/{job_id}/restart"): "submit",
     ("POST", "/v1/jobs/{job_id}/cancel"): "cancel",
+    ("PATCH", "/v1/jobs/{job_id}"): "prioritise",
     ("DELETE", "/v1/jobs/{job_id}"): "delete-job",
     ("GET", "/v1/jobs/{job_id}/results"): "read-results",
     ("GET", "/v1/jobs/{job_id}/results/{file}"): "read-results",

@@ -243,10 +243,10 @@ class Calibration:
         return found, {}
 
     def sigmas(self, here: Level, descent: Descent, corrected: Frames) -> tuple[Array, Array]:
-        """Standard deviations of omega [views, 3] rad and tau [views, 3] mm, from the images of a steady level; zero
-        for what was not fitted."""
-        if self._options.calibrate != "full":
-            return np.zeros((len(corrected), 3)), np.zeros((len(corrected), 3))
+        """Standard deviations of omega [views, 3] rad and tau [views, 3] mm, from the images of a steady level; NaN
+        where no view was moved, inf where the images do not show the motion."""
+        if self._options.calibrate != "full" or self._still:
+            return np.full((len(corrected), 3), np.nan), np.full((len(corrected), 3), np.nan)
         covariance = pose_covariance(
             descent.splats,
             self.corrected(here.nominal),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatcore import _native
+from splatcore.errors import ReconstructionError
 from splatcore.geometry import Array
 from splatcore.planar import Plane
 from splatcore.splats import Floats, Splats
@@ -30,6 +31,12 @@ class Rates:
     def times(self, factor: float) -> Rates:
         """All rates at the start by a factor; they fall by as much as before."""
         return Rates(self.mean * factor, self.log_scale * factor, self.quat * factor, self.density * factor, self.end)
+
+
+def require_finite(loss: float, where: str, step: int) -> None:
+    """Raises ReconstructionError for a loss that is NaN or infinite: nothing good comes after it."""
+    if not np.isfinite(loss):
+        raise ReconstructionError(f"the loss became {loss} {where}, step {step}; a bug, please report it")
 
 
 class Descent:

@@ -15,11 +15,12 @@ from splatcore.reconstruction import Reconstruction
 from splatcore.scangeometry import read_frames
 
 FORMAT = "splatct-poses/1"
-_NOTE = "sigma null: this direction or parameter does not show in the projections; it was left at its nominal value"
+_UNSEEN = "sigma null: this direction or parameter does not show in the projections; it was left at its nominal value"
+_UNMOVED = "sigma null: no view was moved, so nothing is stated of how well its pose is known"
 
 
 def poses_document(r: Reconstruction) -> dict[str, Any]:
-    """poses.json of a reconstruction. Numbers that are not finite become null, and a note says why."""
+    """poses.json of a reconstruction. Numbers that are not finite become null, and notes say why."""
     omega, tau = r.corrections.vectors()
     rotation = np.rad2deg(omega)
     views = [
@@ -45,9 +46,9 @@ def poses_document(r: Reconstruction) -> dict[str, Any]:
         "gauge": r.gauge,
     }
     sigmas = (r.sigma_rotation_deg, r.sigma_translation_mm, np.array(list(r.static_sigma.values())))
-    if not all(np.isfinite(sigma).all() for sigma in sigmas):
-        document["notes"] = [_NOTE]
-    return document
+    notes = {_UNMOVED: np.isnan, _UNSEEN: np.isinf}
+    said = [note for note, which in notes.items() if any(which(sigma).any() for sigma in sigmas)]
+    return document | ({"notes": said} if said else {})
 
 
 def _plain(value: float | bool) -> float | bool | None:

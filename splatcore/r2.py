@@ -228,8 +228,8 @@ class _Run:
         renderer = _native.Renderer32(scan.frames.rows, scan.frames.cols, self._threads)
         top = float(scan.projections.max())
         normals = accumulate(renderer, splats, corrected, scan.projections, scene.mask, top)
-        nothing = np.zeros((len(corrected), 3))
-        sigma = (nothing, nothing)
+        unmoved = np.full((len(corrected), 3), np.nan)
+        sigma = (unmoved, unmoved)
         if self._poses is not None:
             # Neither method states any; these are what the images say, with a prior as wide as the volume.
             sigma = sigmas(normals, Prior(1.0, scene.length_mm))

@@ -23,7 +23,7 @@ from splatcore import r2
 from splatcore.calibration import STATIC_FIRST, Calibration
 from splatcore.checkpoint import identity
 from splatcore.conclusion import conclude, mark_partial
-from splatcore.descent import Descent, Rates
+from splatcore.descent import Descent, Rates, require_finite
 from splatcore.errors import OptionsError, ReconstructionError
 from splatcore.estimate import default_splats
 from splatcore.exposure import finding
@@ -208,10 +208,7 @@ class _Run:
             if now["order"] and now["step"] < work.steps:
                 continue
             step, loss = now["step"], now["loss"]
-            if not np.isfinite(loss):
-                raise ReconstructionError(
-                    f"the loss became {loss} at binning {here.factor}, step {step}; a bug, please report it"
-                )
+            require_finite(loss, f"at binning {here.factor}", step)
             self._fraction = self._schedule.fraction(self._stage, step)
             if self._schedule.levels == 1 and 2 * step >= work.steps:
                 calibration.settle_yaw()

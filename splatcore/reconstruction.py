@@ -25,7 +25,7 @@ class Reconstruction:
     nominal: Frames  # as the scan gave them
     corrected: Frames  # static and per-view corrections applied
     corrections: RigidMotions  # per view, after the static part
-    sigma_rotation_deg: Array  # [views, 3] one standard deviation; inf: not observable
+    sigma_rotation_deg: Array  # [views, 3] one standard deviation; inf: not observable, NaN: not moved
     sigma_translation_mm: Array  # [views, 3] likewise
     residual_rms: Array  # [views] in line-integral units
     static: dict[str, Any]  # the scanner's constant errors: "cor_px", "roll_deg", ...; what was turned round

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from splatcore.descent import Descent, Rates
+from splatcore.descent import Descent, Rates, require_finite
 from splatcore.geometry import Array, Frames
 from splatcore.pyramid import Level
 from splatcore.splats import Floats
@@ -91,6 +91,7 @@ class Refinement:
                 self._variation.add_gradient(self.descent.splats, self.descent.gradient, self._rng)
             self.descent.update()
             if not self._order:
+                require_finite(self._loss, "in the last stage", self.step)
                 yield self._loss / self._drawn
             if book:
                 book.pause()

@@ -15,6 +15,8 @@ import sqlalchemy as sa
 
 metadata = sa.MetaData()
 
+_ADVISORY_LOCK = 0x5155  # the first half of a pair whose second is a name
+
 
 class Database:
     """Connections to one database. Open it after a fork, never before."""
@@ -40,6 +42,13 @@ class Database:
 
     def close(self) -> None:
         self.engine.dispose()
+
+
+def alone(write: sa.Connection, name: str) -> None:
+    """For the rest of the transaction no other that asks for it has this name, be it a tenant's or a key's. SQLite has
+    one writer as it is."""
+    if write.dialect.name == "postgresql":
+        write.execute(sa.select(sa.func.pg_advisory_xact_lock(_ADVISORY_LOCK, sa.func.hashtext(name))))
 
 
 def _prepare_sqlite(connection: Any, _record: Any) -> None:

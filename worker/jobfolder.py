@@ -134,17 +134,6 @@ class JobFolder:
             return False
         return _stamp(self.checkpoint) not in (None, began_with)
 
-    def log_tail(self, most: int = 1000) -> str:
-        """The end of the engine's log, whole lines."""
-        try:
-            with self.log.open("rb") as file:
-                size = file.seek(0, os.SEEK_END)
-                file.seek(max(0, size - most))
-                text = file.read().decode(errors="replace")
-        except FileNotFoundError:
-            return ""
-        return (text if size <= most else text.partition("\n")[2]).strip()
-
     def published(self) -> bool:
         """Whether results stand. The folder appears by one rename, its manifest inside."""
         return (self.results / "manifest.json").is_file()
@@ -184,12 +173,25 @@ class JobFolder:
             self.checkpoint.unlink(missing_ok=True)
         self.checkpoint.with_name(f".{self.checkpoint.name}.part").unlink(missing_ok=True)
 
+    def kept_bytes(self) -> int:
+        """Of what stays of a job that has ended. The scan is its store's."""
+        kept = [self.events, self.log, *self.results.glob("*"), *self.partial.glob("*")]
+        sizes = map(_size, kept if self.published() else [*kept, self.checkpoint])
+        return sum(sizes)
+
     def remove(self) -> None:
         """Delete everything. Renamed first, so that a half-deleted folder is never taken for a job."""
         doomed = self.path.with_name(f".deleted-{self.path.name}")
         with contextlib.suppress(FileNotFoundError):
             self.path.rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
+
+
+def _size(file: Path) -> int:
+    try:
+        return file.stat().st_size
+    except FileNotFoundError:
+        return 0
 
 
 def _stamp(file: Path) -> list[int] | None:

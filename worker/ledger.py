@@ -47,6 +47,9 @@ jobs = sa.Table(
     sa.Column("partial", sa.Boolean, nullable=False, server_default=sa.false()),  # it left a partial result
     sa.Column("restart_of", sa.String(36)),  # the job that it was made from
     sa.Column("pinned", sa.Boolean, nullable=False, server_default=sa.false()),  # kept, however old it grows
+    # Of the disk: as estimated until it has ended, then, once measured, what is left of it.
+    sa.Column("bytes", sa.BigInteger, nullable=False, server_default=sa.text("0")),
+    sa.Column("measured", sa.Boolean, nullable=False, server_default=sa.false(), index=True),
     sa.Index("ix_jobs_tenant_created_at", "tenant", "created_at"),
     sa.Index("ix_jobs_tenant_started_at", "tenant", "started_at"),
 )
@@ -80,6 +83,8 @@ class Job:
     partial: bool
     restart_of: str | None
     pinned: bool
+    bytes: int
+    measured: bool
 
 
 class Ledger:
@@ -102,10 +107,12 @@ class Ledger:
         options: dict[str, Any],
         priority: Priority = Priority.NORMAL,
         restart_of: str | None = None,
+        size: int = 0,
     ) -> None:
-        """Insert a queued job within the caller's transaction. `scan` is (id, name)."""
+        """Insert a queued job within the caller's transaction. `scan` is (id, name); `size`: bytes it may come to."""
         row: dict[str, Any] = {"id": job_id, "name": name, "scan_id": scan[0], "scan_name": scan[1], "options": options}
         row |= {"tenant": self._tenant or LOCAL_TENANT, "priority": int(priority), "restart_of": restart_of}
+        row["bytes"] = size
         write.execute(jobs.insert().values(**row, state=State.QUEUED, message="Waiting", created_at=time.time()))
 
     def get(self, job_id: str) -> Job | None:
@@ -228,7 +235,7 @@ class Ledger:
         """Queue the job again because its worker was told to stop: nobody's fault, not counted."""
         return self._requeue(job_id, attempt, "Its worker was stopped; waiting for another")
 
-    def crashed(self, job: Job, what: str, advanced: bool = False, log_tail: str = "") -> State | None:
+    def crashed(self, job: Job, what: str, advanced: bool = False) -> State | None:
         """Queue the job again after its attempt died, or fail it if that happened too often. Returns what became of it,
         None if it is no longer that attempt's.
 
@@ -239,9 +246,7 @@ class Ledger:
         if crashes < MAX_CRASHES:
             again = self._requeue(job.id, job.attempt, f"{what}; waiting to go on", crashes=crashes)
             return State.QUEUED if again else None
-        message = f"{what}, {crashes} times without getting further. Restart the job when the cause is gone."
-        if log_tail:
-            message += f" Its log ends with:\n{log_tail}"
+        message = f"{what}, {crashes} times without getting further. Its log may say why; restart it then."
         return State.FAILED if self.fail(job.id, job.attempt, ErrorKind.CRASHED, message) else None
 
     def ask_cancel(self, job_id: str) -> Job | None:
@@ -261,6 +266,24 @@ class Ledger:
         mine = sa.and_(jobs.c.id == job_id, self._mine())
         with self._database.writing() as write:
             return write.execute(jobs.update().where(mine).values(pinned=pinned)).rowcount == 1
+
+    def prioritise(self, job_id: str, priority: Priority) -> bool:
+        """Give a job another place in its tenant's queue, the next time it waits; False if it has finished."""
+        mine = sa.and_(jobs.c.id == job_id, self._mine(), jobs.c.state.in_(list(ACTIVE)))
+        with self._database.writing() as write:
+            return write.execute(jobs.update().where(mine).values(priority=int(priority))).rowcount == 1
+
+    def unmeasured(self, most: int) -> list[str]:
+        """Jobs that have ended, and of which nobody has measured yet what is left."""
+        query = sa.select(jobs.c.id).where(jobs.c.measured == sa.false(), jobs.c.state.in_(list(FINISHED))).limit(most)
+        with self._database.reading() as read:
+            return list(read.execute(query).scalars())
+
+    def measured(self, sizes: dict[str, int]) -> None:
+        """What is left of jobs, in bytes."""
+        with self._database.writing() as write:
+            for job_id, size in sizes.items():
+                write.execute(jobs.update().where(jobs.c.id == job_id).values(bytes=size, measured=True))
 
     def forget(self, job_id: str) -> bool:
         """Delete the row of a finished job."""

@@ -27,6 +27,7 @@ from worker.ledger import Job, Ledger
 from worker.lifeline import die_with_parent, host_id
 from worker.oom import OomWatch
 from worker.process import EngineProcess
+from worker.redaction import Redaction
 from worker.settings import WorkerSettings
 
 log = logging.getLogger("splatct.worker")
@@ -133,6 +134,7 @@ class _Attempt:
         self._timed_out = False
         self._killed_by_us = False
         self._memory = OomWatch()
+        self._redacted = Redaction(settings.data.absolute(), folder.path)
 
     def run(self) -> None:
         if self._folder.published():  # an earlier attempt got this far and died before saying so
@@ -193,9 +195,10 @@ class _Attempt:
 
     def _take(self, event: dict[str, Any], events: EventWriter) -> None:
         if "error" in event:
-            self._error = str(event["error"])
+            self._error = self._redacted(str(event["error"]))
             return
-        event = {**event, "attempt": self._job.attempt}
+        said = {name: self._redacted(value) if isinstance(value, str) else value for name, value in event.items()}
+        event = {**said, "attempt": self._job.attempt}
         self._keep(event, events)
         fraction = min(1.0, max(0.0, float(event.get("fraction", 0.0))))
         # The engine's own clock counts what earlier attempts have done of it.
@@ -267,8 +270,7 @@ class _Attempt:
         elif code == -signal.SIGKILL and not self._killed_by_us and self._memory.killed():
             ledger.fail(job.id, job.attempt, ErrorKind.OUT_OF_MEMORY, _OUT_OF_MEMORY)
         else:
-            folder = self._folder
-            end = ledger.crashed(job, _obituary(code), advanced=folder.advanced(), log_tail=folder.log_tail())
+            end = ledger.crashed(job, _obituary(code), advanced=self._folder.advanced())
             if end is not State.FAILED:
                 return
         self._folder.tidy()

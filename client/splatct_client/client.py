@@ -5,86 +5,48 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self
-from urllib.parse import quote, urlsplit
+from typing import Any
+from urllib.parse import quote
 from uuid import uuid4
 
 import httpx
 
-from splatct_client.credentials import checked
+from splatct_client.connection import Connection, parsed
 from splatct_client.download import fetch_file
-from splatct_client.errors import (
-    ClientError,
-    InputError,
-    IntegrityError,
-    KeyNeeded,
-    Problem,
-    ServerProblem,
-    ServerUnreachable,
-    UnexpectedAnswer,
-)
-from splatct_client.models import FileSpec, Job, ResultFile, Scan, Upload, UploadedFile
+from splatct_client.errors import IntegrityError, ServerProblem, UnexpectedAnswer
+from splatct_client.models import Delivery, FileSpec, Job, ResultFile, Scan, Upload, UploadedFile, Webhook
 from splatct_client.resume import CHUNK as RESUMED_FROM
 from splatct_client.resume import send_in_chunks
-from splatct_client.retry import NEVER_DONE_STATUS, RETRIED_STATUS, Patience, retry_after_s
+from splatct_client.retry import retry_after_s
 
 CHUNK = 1 << 20
-LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
-LONGEST_WAIT_S = 30.0  # of one long poll; proxies give up on a silent request after 60 s
 SHORTEST_PAUSE_S = 0.5
+_PINNING = {True: "POST", False: "DELETE"}
 OnBytes = Callable[[int], None]
 
 
-class Client:
-    """A connection to one server. Use it as a context manager, from one thread.
-
-    Calls are repeated for `patience` while the server is away or overloaded; what must not
-    happen twice (a new upload) only if the server cannot have done it. A server that
-    never answered at all is reported at once.
-    """
-
-    def __init__(
-        self,
-        base_url: str,
-        *,
-        key: str | None = None,
-        patience: Patience | None = None,
-        timeout_s: float = 60.0,
-        transport: httpx.BaseTransport | None = None,
-    ) -> None:
-        address = urlsplit(base_url)
-        if address.scheme not in ("http", "https") or not address.hostname:
-            raise InputError(f"server: got {base_url!r}, expected an address such as http://127.0.0.1:8080")
-        if "@" in address.netloc:  # not repeated: addresses end up in logs and in what is printed
-            raise InputError("server: the address holds a user's name or a secret; a key goes into --key-file")
-        self.base_url = base_url.rstrip("/")
-        self.patience = patience or Patience()
-        self._reached = False
-        self._wait_s = min(LONGEST_WAIT_S, timeout_s / 2)
-        headers = {"User-Agent": "splatct-client/1", "Accept": "application/json"}
-        if key is not None:
-            headers["Authorization"] = f"Bearer {checked(key, 'key')}"
-        self._has_key = key is not None
-        self._http = httpx.Client(
-            base_url=self.base_url,
-            follow_redirects=False,  # the key is for this address alone
-            timeout=httpx.Timeout(timeout_s, connect=min(10.0, timeout_s)),
-            transport=transport,
-            trust_env=address.hostname not in LOOPBACK,  # no proxy to oneself
-            headers=headers,
-        )
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._http.close()
+class Client(Connection):
+    """What one server can do."""
 
     # Uploads
 
-    def create_upload(self, name: str, files: Sequence[FileSpec]) -> Upload:
-        body = {"name": name, "files": [file.to_json() for file in files]}
+    def create_upload(self, name: str, files: Sequence[FileSpec], growing: bool = False) -> Upload:
+        """growing: more files are announced later, scan.json among them perhaps."""
+        body: dict[str, Any] = {"name": name, "files": [file.to_json() for file in files]}
+        body |= {"growing": True} if growing else {}
         return Upload.from_json(self._json("POST", "/v1/uploads", json=body, repeatable=False))
+
+    def announce(self, upload_id: str, files: Sequence[FileSpec]) -> list[UploadedFile]:
+        """More files of an open upload; repeated unchanged it does no harm."""
+        body = {"files": [file.to_json() for file in files]}
+        answer = self._json("POST", f"/v1/uploads/{_id(upload_id)}/files", json=body)
+        return [UploadedFile.from_json(file) for file in _items(answer, "files")]
+
+    def import_scan(self, folder: str, name: str | None = None) -> Upload:
+        """A folder of the server's own disks as an upload whose files are complete; commit it then."""
+        body = {"folder": folder} | ({} if name is None else {"name": name})
+        answer = self._json("POST", "/v1/imports", json=body, repeatable=False, timeout=1800.0)
+        return Upload.from_json(answer)
 
     def upload(self, upload_id: str) -> Upload:
         return Upload.from_json(self._json("GET", f"/v1/uploads/{_id(upload_id)}"))
@@ -132,6 +94,10 @@ class Client:
     def abandon(self, upload_id: str) -> None:
         self._request("DELETE", f"/v1/uploads/{_id(upload_id)}")
 
+    def scans(self) -> list[Scan]:
+        """Committed scans, newest first."""
+        return [Scan.from_json(scan) for scan in _items(self._json("GET", "/v1/scans"), "scans")]
+
     # Jobs
 
     def options(self) -> list[dict[str, Any]]:
@@ -144,19 +110,51 @@ class Client:
         options: dict[str, Any] | None = None,
         name: str | None = None,
         priority: str | None = None,
+        job_id: str | None = None,
     ) -> Job:
-        """priority: low, normal or high among one's own jobs."""
+        """priority: low, normal or high among one's own jobs. job_id: a UUID of one's own, under which the same may be
+        submitted again, in a later run too, and is one job."""
         body: dict[str, Any] = {"scan_id": scan_id, "options": options or {}}
         if name is not None:
             body["name"] = name
         if priority is not None:
             body["priority"] = priority
         try:  # under an id of our own it can be repeated until there is an answer, and there is one job
-            return Job.from_json(self._json("PUT", f"/v1/jobs/{uuid4()}", json=body))
+            return Job.from_json(self._json("PUT", f"/v1/jobs/{_id(job_id or str(uuid4()))}", json=body))
         except ServerProblem as problem:
             if problem.status != 405:
                 raise
         return Job.from_json(self._json("POST", "/v1/jobs", json=body, repeatable=False))  # an older server
+
+    def validate(self, scan_id: str, options: dict[str, Any] | None = None) -> dict[str, Any]:
+        """What a job would cost: `memory_bytes`, `seconds`, `disk_bytes`, `warnings` and more. Nothing is run."""
+        estimate = self._json("POST", "/v1/jobs/validate", json={"scan_id": scan_id, "options": options or {}})
+        if not isinstance(estimate, dict):
+            raise UnexpectedAnswer("the server's estimate is no JSON object")
+        return estimate
+
+    def restart(
+        self,
+        job_id: str,
+        options: dict[str, Any] | None = None,
+        name: str | None = None,
+        priority: str | None = None,
+    ) -> Job:
+        """A new job of a finished one's scan; what is given changes."""
+        given = {"options": options or None, "name": name, "priority": priority}
+        body = {key: value for key, value in given.items() if value is not None}
+        once = {"Idempotency-Key": str(uuid4())}  # so that it may be repeated until there is an answer
+        return Job.from_json(self._json("POST", f"/v1/jobs/{_id(job_id)}/restart", json=body, headers=once))
+
+    def prioritise(self, job_id: str, priority: str) -> Job:
+        return Job.from_json(self._json("PATCH", f"/v1/jobs/{_id(job_id)}", json={"priority": priority}))
+
+    def pin(self, job_id: str, pinned: bool = True) -> Job:
+        """Keep a job's results, however old they grow; or no longer."""
+        return Job.from_json(self._json(_PINNING[pinned], f"/v1/jobs/{_id(job_id)}/pin"))
+
+    def pin_scan(self, scan_id: str, pinned: bool = True) -> Scan:
+        return Scan.from_json(self._json(_PINNING[pinned], f"/v1/scans/{_id(scan_id)}/pin"))
 
     def job(self, job_id: str) -> Job:
         return Job.from_json(self._json("GET", f"/v1/jobs/{_id(job_id)}"))
@@ -184,7 +182,7 @@ class Client:
             answer = self._request("GET", url, **query)
             news = answer.status_code != 304
             if news:
-                job = Job.from_json(_parsed(answer))
+                job = Job.from_json(parsed(answer))
                 if on_progress:
                     on_progress(job)
                 if job.finished:
@@ -197,6 +195,24 @@ class Client:
             pause = SHORTEST_PAUSE_S if news else min(pause * 1.5, 5.0)
             later = retry_after_s(answer.headers.get("Retry-After"))
             self.patience.sleep(min(later, 30.0) if later is not None else pause)
+
+    # Webhooks
+
+    def add_webhook(self, url: str, events: Sequence[str] | None = None) -> Webhook:
+        """The only answer that has the secret. events: all where left out."""
+        body: dict[str, Any] = {"url": url} | ({"events": list(events)} if events else {})
+        return Webhook.from_json(self._json("POST", "/v1/webhooks", json=body, repeatable=False))
+
+    def webhooks(self) -> list[Webhook]:
+        return [Webhook.from_json(one) for one in _items(self._json("GET", "/v1/webhooks"), "webhooks")]
+
+    def remove_webhook(self, webhook_id: str) -> None:
+        self._request("DELETE", f"/v1/webhooks/{_id(webhook_id)}")
+
+    def deliveries(self, webhook_id: str) -> list[Delivery]:
+        """Newest first, 200 at most."""
+        answer = self._json("GET", f"/v1/webhooks/{_id(webhook_id)}/deliveries")
+        return [Delivery.from_json(one) for one in _items(answer, "deliveries")]
 
     # Results
 
@@ -217,77 +233,6 @@ class Client:
         """Fetch one result file into `folder`: resumed, checked, and there under its name only when whole."""
         return fetch_file(self, f"/v1/jobs/{_id(job_id)}/{kind}/{_name(file.name)}", file, folder, on_bytes)
 
-    # The wire
-
-    def offset(self, url: str) -> httpx.Response:
-        """HEAD of a file of an upload: `Upload-Offset` is where to go on."""
-        return self._request("HEAD", url)
-
-    def send_chunk(
-        self, url: str, headers: dict[str, str], body: Callable[[], Iterator[bytes]], size: int
-    ) -> httpx.Response:
-        """One PATCH. Repeated only if the server cannot have taken any of it: see `resume`."""
-        return self._request("PATCH", url, repeatable=False, content=body, size=size, headers=headers)
-
-    def stream(self, url: str, headers: dict[str, str]) -> httpx.Response:
-        """A GET whose body has not been read yet; the caller closes it. Not repeated: see `download`."""
-        response = self._http.send(
-            self._http.build_request("GET", url, headers={"Accept-Encoding": "identity", **headers}), stream=True
-        )
-        if (response.is_error and response.status_code != 416) or response.has_redirect_location:
-            response.read()
-            response.close()
-            raise self._refusal(response)
-        return response
-
-    def _json(self, method: str, url: str, **kwargs: Any) -> Any:
-        return _parsed(self._request(method, url, **kwargs))
-
-    def _request(
-        self,
-        method: str,
-        url: str,
-        *,
-        repeatable: bool = True,
-        content: Callable[[], Iterator[bytes]] | None = None,
-        size: int = 0,
-        timeout: float | None = None,
-        **kwargs: Any,
-    ) -> httpx.Response:
-        if timeout is not None:
-            kwargs["timeout"] = timeout
-        attempts = self.patience.start()
-        if content is not None:
-            kwargs["headers"] = {**kwargs.get("headers", {}), "Content-Length": str(size)}
-        while True:
-            if content is not None:
-                kwargs["content"] = content()
-            try:
-                response = self._http.request(method, url, **kwargs)
-            except httpx.LocalProtocolError:
-                raise
-            except httpx.TransportError as error:
-                never_sent = isinstance(error, (httpx.ConnectError, httpx.ConnectTimeout))
-                if not self._reached or not (repeatable or never_sent) or not attempts.pause():
-                    raise ServerUnreachable(self.base_url, error) from error
-                continue
-            self._reached = True
-            if not response.is_error and not response.has_redirect_location:
-                return response
-            again = response.status_code in (RETRIED_STATUS if repeatable else NEVER_DONE_STATUS)
-            if not again or not attempts.pause(retry_after_s(response.headers.get("Retry-After"))):
-                raise self._refusal(response)
-
-    def _refusal(self, response: httpx.Response) -> ClientError:
-        if response.has_redirect_location:
-            return UnexpectedAnswer(
-                f"{self.base_url} sends on to another address, which is not followed: the key is for this one alone; "
-                "give the server's final address with --server URL or SPLATCT_SERVER"
-            )
-        if response.status_code == 401 and not self._has_key:
-            return KeyNeeded(self.base_url)
-        return _problem(response)
-
 
 def _id(text: str) -> str:
     return quote(text, safe="")
@@ -306,36 +251,8 @@ def _chunks(source: Path | bytes) -> Iterator[bytes]:
             yield chunk
 
 
-def _parsed(response: httpx.Response) -> Any:
-    try:
-        return response.json()
-    except ValueError:
-        kind = response.headers.get("Content-Type", "no type")
-        raise UnexpectedAnswer(
-            f"{response.request.url} answered with {kind}, not JSON: is it a SplatCT server?"
-        ) from None
-
-
 def _items(data: Any, key: str) -> list[Any]:
     items = data.get(key) if isinstance(data, dict) else None
     if not isinstance(items, list):
         raise UnexpectedAnswer(f"the server's answer has no list {key!r}")
     return items
-
-
-def _problem(response: httpx.Response) -> ServerProblem:
-    """The exception for an error answer, problem+json or not."""
-    try:
-        body = response.json()
-    except ValueError:
-        body = None
-    if not isinstance(body, dict):
-        body = {}
-    listed = [error for error in body.get("errors") or [] if isinstance(error, dict)]
-    return ServerProblem(
-        response.status_code,
-        str(body.get("title") or response.reason_phrase or "the server refused"),
-        str(body.get("detail") or ""),
-        str(body.get("type") or "about:blank"),
-        [Problem(str(e.get("where", "")), str(e.get("what", "")), str(e.get("hint") or "")) for e in listed],
-    )

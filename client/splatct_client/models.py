@@ -68,7 +68,10 @@ class Scan(_FromJson):
 
     id: str
     name: str = ""
+    bytes: int = 0
     facts: dict[str, Any] = field(default_factory=dict)
+    pinned: bool = False
+    created_at: str | None = None
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,9 @@ class Job(_FromJson):
     eta_s: float | None = None
     queue_position: int | None = None
     attempt: int = 1
+    priority: str = "normal"
+    restart_of: str | None = None
+    pinned: bool = False
     options: dict[str, Any] = field(default_factory=dict)
     created_at: str | None = None
     started_at: str | None = None
@@ -113,3 +119,30 @@ class ResultFile(_FromJson):
     name: str
     size: int
     sha256: str
+
+
+@dataclass(frozen=True)
+class Webhook(_FromJson):
+    """`secret` is what signatures are made with; None but in the answer that made it."""
+
+    id: str
+    url: str
+    events: list[str] = field(default_factory=list)
+    created_at: str | None = None
+    secret: str | None = None
+
+
+@dataclass(frozen=True)
+class Delivery(_FromJson):
+    """One message to a webhook, and how the telling went: `waiting`, `delivered` or `given up`."""
+
+    id: str
+    job_id: str
+    event: str
+    state: str
+    attempts: int = 0
+    status: int | None = None
+    error: str | None = None
+    created_at: str | None = None
+    delivered_at: str | None = None
+    next_at: str | None = None

@@ -27,8 +27,10 @@ class ScanFolder:
     @property
     def specs(self) -> list[FileSpec]:
         """With digests, for which all of the scan is read: what the server has already need not be sent."""
-        scan = FileSpec("scan.json", len(self.scan_json), hashlib.sha256(self.scan_json).hexdigest())
-        return [scan, *(_spec(name, path) for name, path in self.files.items())]
+        return [self.json_spec(), *(spec_of(name, path) for name, path in self.files.items())]
+
+    def json_spec(self) -> FileSpec:
+        return FileSpec("scan.json", len(self.scan_json), hashlib.sha256(self.scan_json).hexdigest())
 
     @property
     def size(self) -> int:
@@ -74,7 +76,7 @@ def read_scan_folder(folder: Path) -> ScanFolder:
     )
 
 
-def _spec(name: str, path: Path) -> FileSpec:
+def spec_of(name: str, path: Path) -> FileSpec:
     with path.open("rb") as stream:
         sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
         return FileSpec(name, stream.tell(), sha256)

@@ -15,6 +15,7 @@ from server.migrations import (
     v0006_durable_jobs,
     v0007_retention,
     v0008_contents,
+    v0009_accounts,
 )
 
 STEPS: tuple[Callable[[sa.Connection], None], ...] = (
@@ -26,4 +27,5 @@ STEPS: tuple[Callable[[sa.Connection], None], ...] = (
     v0006_durable_jobs.upgrade,
     v0007_retention.upgrade,
     v0008_contents.upgrade,
+    v0009_accounts.upgrade,
 )

@@ -19,6 +19,7 @@ export async function signIn(key) {
 
 export async function call(path, init = {}) {
   const headers = { Accept: "application/json" };
+  if (init.body) headers["Content-Type"] = "application/json";
   if (init.method) {
     if (csrf === null) await session();
     if (csrf !== null) headers["X-CSRF-Token"] = csrf;
@@ -41,9 +42,12 @@ async function problem(response) {
   return Object.assign(new Error(text), { status: response.status });
 }
 
+export function setConnection(there) {
+  setText(byId("connection"), there ? "" : "The server does not answer; trying again");
+}
+
 // Runs `refresh` again and again; it returns the pause in ms, or null to stop. A hidden page rests.
 export function keepFresh(refresh, onRefused) {
-  const connection = byId("connection");
   let failures = 0;
   const turn = async () => {
     if (document.hidden) {
@@ -54,14 +58,14 @@ export function keepFresh(refresh, onRefused) {
     try {
       pause = await refresh();
       failures = 0;
-      setText(connection, "");
+      setConnection(true);
     } catch (error) {
       if (error.status && error.status < 500) {
         onRefused(error);
         return;
       }
       failures += 1;
-      setText(connection, "The server does not answer; trying again");
+      setConnection(false);
       pause = Math.min(2000 * failures, 15000);
     }
     if (pause !== null) setTimeout(turn, pause);

@@ -1,7 +1,11 @@
 // One job: progress while it runs, results once it has them.
 
+import { Actions } from "./actions.js";
+import { offerAgain } from "./again.js";
 import { call, keepFresh, notice } from "./api.js";
 import { byId, bytes, duration, el, finished, moment, place, setText, stateBadge, took, update } from "./dom.js";
+import { follow } from "./follow.js";
+import { showLogOf } from "./joblog.js";
 import { Live } from "./live.js";
 import { showPoses } from "./poses.js";
 import { showReport } from "./report.js";
@@ -11,8 +15,9 @@ const id = byId("job").dataset.id;
 const url = `/v1/jobs/${encodeURIComponent(id)}`;
 const STAGES = [["read", "Read"], ["start", "First volume"], ["level", "Fit splats and poses"], ["diagnose", "Diagnose"], ["write", "Write"]];
 
+const actions = new Actions(url, show);
 let live = null;
-let resultsShown = false;
+let endShown = false;
 
 function show(job) {
   const name = job.name || job.scan_name || "unnamed";
@@ -20,8 +25,7 @@ function show(job) {
   const percent = finished(job) || job.state === "queued" ? job.state : `${Math.round(job.progress * 100)} %`;
   document.title = `${percent} · ${name} · SplatCT`;
   update(byId("state"), [stateBadge(job)]);
-  byId("cancel").hidden = !["queued", "running", "cancelling"].includes(job.state);
-  byId("cancel").disabled = job.state === "cancelling";
+  actions.show(job);
 
   byId("progress-panel").hidden = finished(job);
   byId("bar").value = job.progress;
@@ -54,9 +58,10 @@ function showDetails(job) {
     ["Attempt", String(job.attempt)],
     ["Options", options.join(", ") || "all at their defaults"],
     ["Job", el("code", {}, job.id)],
-    ["Log", el("a", { href: `${url}/log` }, "engine's log")],
+    ["Priority", job.priority],
+    ["Restart of", job.restart_of ? el("a", { href: `/jobs/${encodeURIComponent(job.restart_of)}` }, "an earlier job") : null],
   ];
-  update(byId("facts"), rows.flatMap(([name, value]) => [el("dt", {}, name), el("dd", {}, value ?? "–")]));
+  update(byId("facts"), rows.filter(([, value]) => value !== null).flatMap(([name, value]) => [el("dt", {}, name), el("dd", {}, value ?? "–")]));
   byId("details").hidden = false;
 }
 
@@ -87,36 +92,66 @@ async function showResults(kind) {
   if (failed.length) notice(`Some results cannot be shown: ${failed.map((part) => part.reason.message).join("; ")}`);
 }
 
+function curves() {
+  live ??= new Live(id);
+  return live;
+}
+
 async function refresh() {
   const job = await call(url);
   show(job);
   if (job.state !== "queued" || job.attempt > 1) {
-    byId("live").hidden = false;
-    live ??= new Live(id);
-    await live.refresh();
-    byId("live").hidden = finished(job) && live.last === 0;
+    await curves().refresh();
+    showCurves(job);
   }
-  const kind = job.state === "succeeded" ? "results" : job.links?.partial ? "partial" : null;
-  if (kind && !resultsShown) {
-    await showResults(kind);
-    resultsShown = true;
-  }
+  await showEnd(job);
   return finished(job) ? null : 2000;
 }
 
-async function cancel() {
-  if (!confirm("Cancel this job? What it has computed so far is kept as a partial result.")) return;
-  try {
-    show(await call(`${url}/cancel`, { method: "POST" }));
-  } catch (error) {
-    notice(error.message);
-  }
+function showCurves(job) {
+  byId("live").hidden = live === null || (finished(job) && live.last === 0);
 }
 
-setText(byId("fetch-command"), `splatct fetch ${id} --server ${location.origin} -o RESULTS`);
-byId("cancel").addEventListener("click", cancel);
-keepFresh(refresh, (error) => {
+// What only a job that has ended has: results, whole or partial, and another run.
+async function showEnd(job) {
+  if (!finished(job) || endShown) return;
+  endShown = true;
+  const kind = job.state === "succeeded" ? "results" : job.links?.partial ? "partial" : null;
+  await actions.known;
+  const parts = [kind ? showResults(kind) : null, actions.may("submit") ? offerAgain(url, job) : null];
+  const failed = (await Promise.allSettled(parts)).filter((part) => part.status === "rejected");
+  if (failed.length) notice(`Some of it cannot be shown: ${failed.map((part) => part.reason.message).join("; ")}`);
+}
+
+function refused(error) {
   const missing = error.status === 404 || error.status === 422;
   setText(byId("name"), missing ? "No such job" : "Job");
   notice(missing ? "This server has no such job. It may have been deleted; the list of jobs shows the rest." : error.message);
-});
+}
+
+// First all that there is, then what happens from here on.
+async function begin() {
+  const pause = await refresh();
+  if (pause === null) return null;
+  follow(url, {
+    take(event) {
+      curves().takeNext(event);
+      byId("live").hidden = false;
+    },
+    show,
+    async end(job) {
+      if (!job.id) return refused({ status: 404 });
+      show(job);
+      showCurves(job);
+      await showEnd(job);
+    },
+    last: () => live?.last ?? 0,
+    poll: refresh,
+    refused,
+  });
+  return null;
+}
+
+setText(byId("fetch-command"), `splatct fetch ${id} --server ${location.origin} -o RESULTS`);
+showLogOf(url);
+keepFresh(begin, refused);

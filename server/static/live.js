@@ -4,10 +4,13 @@ import { call } from "./api.js";
 import { chart } from "./chart.js";
 import { byId } from "./dom.js";
 
+const DRAW_MS = 200;
+
 export class Live {
   constructor(jobId) {
     this.url = `/v1/jobs/${encodeURIComponent(jobId)}/events`;
     this.last = 0;
+    this.drawing = null;
     this.restart();
     this.loss = chart({ title: "Residual", xLabel: "step", yLabel: "mean |residual|" });
     this.turn = chart({ title: "Pose motion, rotation", xLabel: "sweep", yLabel: "RMS change, °" });
@@ -49,6 +52,15 @@ export class Live {
     if (Number.isFinite(event.loss)) this.losses.push([x, event.loss]);
     if (Number.isFinite(event.moved_deg)) this.turns.push([this.turns.length + 1, event.moved_deg]);
     if (Number.isFinite(event.moved_mm)) this.shifts.push([this.shifts.length + 1, event.moved_mm]);
+  }
+
+  // One event of a stream; many come at once, and are drawn together.
+  takeNext(event) {
+    this.take(event);
+    this.drawing ??= setTimeout(() => {
+      this.drawing = null;
+      this.draw();
+    }, DRAW_MS);
   }
 
   draw() {

@@ -1,4 +1,6 @@
-"""`splatct keys`: who may use the server. Works on the database directly; a running server sees it at once."""
+"""`splatct keys`: who may use the server, and how much of it. Works on the database directly; a running server sees it
+at once.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from server.audit import AuditLog
     from server.keys import Key
+    from server.settings import Settings
+    from worker.database import Database
 
-HELP = "add, list and revoke the keys that open a server"
+HELP = "add, list and revoke the keys that open a server; what a tenant may take"
 SCOPES = ("read", "submit", "delete", "admin")
 DEFAULT_SCOPES = "read,submit,delete"
 
@@ -27,7 +32,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     shown.add_argument("--tenant", help="only this tenant's")
     revoke = actions.add_parser("revoke", help="make a key useless, at once and for good")
     revoke.add_argument("id", metavar="ID", help="as `splatct keys list` shows it")
-    for action in (add, shown, revoke):
+    tenant = actions.add_parser("tenant", help="show or set what one tenant may take, in place of the settings")
+    tenant.add_argument("tenant", metavar="TENANT")
+    told = "a number, none (no limit) or default (as the server's settings have it)"
+    tenant.add_argument("--max-bytes", metavar="SIZE", help=f"of uploads, scans and results: as 500M, 20G, 2T; {told}")
+    tenant.add_argument("--max-jobs", metavar="N", help=f"that wait and run together: {told}")
+    tenant.add_argument("--max-uploads", metavar="N", help=f"that are open together: {told}")
+    for action in (add, shown, revoke, tenant):
         add_data_option(action)
 
 
@@ -62,6 +73,8 @@ def run(args: argparse.Namespace) -> int:
         elif args.action == "list":
             keys = [key for key in ring.all() if args.tenant in (None, key.tenant)]
             _print(args, {"keys": [described(key) for key in keys]}, _table(keys))
+        elif args.action == "tenant":
+            _quotas(args, settings, database, audit)
         else:
             revoked = ring.revoke(args.id)
             if revoked is None:
@@ -69,6 +82,45 @@ def run(args: argparse.Namespace) -> int:
             audit.note(Deed(revoked.tenant, None, COMMAND_LINE, "revoke-key", revoked.id))
             _print(args, described(revoked), f"key {revoked.id} of {revoked.tenant} is revoked")
     return 0
+
+
+def _quotas(args: argparse.Namespace, settings: Settings, database: Database, audit: AuditLog) -> None:
+    """Change what is asked for, then say what holds."""
+    from server.audit import COMMAND_LINE, Deed
+    from server.quotas import Quotas, set_own
+
+    tenant, asked = _tenant(args.tenant, "keys tenant"), {
+        "bytes": ("--max-bytes", args.max_bytes),
+        "active_jobs": ("--max-jobs", args.max_jobs),
+        "open_uploads": ("--max-uploads", args.max_uploads),
+    }  # fmt: skip
+    wanted = {name: _amount(*given) for name, given in asked.items() if given[1] is not None}
+    if wanted:
+        set_own(database, tenant, wanted)
+        said = " ".join(f"{asked[name][0]} {asked[name][1]}" for name in wanted)
+        audit.note(Deed(tenant, None, COMMAND_LINE, "set-quota", tenant, said))
+    with database.reading() as read:
+        holds = Quotas.from_settings(settings).of(read, tenant)
+    shown = {name: getattr(holds, name) or None for name in asked}
+    text = ", ".join(f"{name.replace('_', ' ')}: {value or 'no limit'}" for name, value in shown.items())
+    _print(args, {"tenant": tenant, **shown}, f"{tenant}: {text}")
+
+
+def _amount(option: str, text: str) -> int | None:
+    """0: no limit; None: as the settings have it."""
+    import re
+
+    from server.settings import SettingsError
+
+    if text in ("none", "default"):
+        return 0 if text == "none" else None
+    given = re.fullmatch(r"([0-9]{1,15})([MGT]?)", text)
+    value = 0 if given is None else int(given[1]) << {"": 0, "M": 20, "G": 30, "T": 40}[given[2]]
+    most = 1 << (60 if option == "--max-bytes" else 30)
+    if given is None or not 0 < value < most or (given[2] and option != "--max-bytes"):
+        kind = "a size such as 500M, 20G or 2T" if option == "--max-bytes" else "a number from 1 up"
+        raise SettingsError(f"{option}: got {text!r}, expected {kind}, none or default")
+    return value
 
 
 def described(key: Key) -> dict[str, Any]:
@@ -110,14 +162,14 @@ def _scopes(text: str) -> list[str]:
     return given
 
 
-def _tenant(text: str) -> str:
+def _tenant(text: str, option: str = "--tenant") -> str:
     import re
 
     from server.settings import SettingsError
 
     if not re.fullmatch(r"[a-z0-9][a-z0-9._-]{0,63}", text):
         raise SettingsError(
-            f"--tenant: got {text!r}, expected 1 to 64 of small letters, digits and ._-, a letter or digit first"
+            f"{option}: got {text!r}, expected 1 to 64 of small letters, digits and ._-, a letter or digit first"
         )
     return text
 

@@ -90,6 +90,8 @@ class FakeApi:
             self.uploads[name] = body
             digest = hashlib.sha256(body).hexdigest()
             return ok({"name": name, "size": len(body), "received": len(body), "complete": True, "sha256": digest})
+        if (method, path) == ("GET", "/uploads/up-1") and self.announced:
+            return ok({"id": "up-1", "name": self.announced["name"], "state": "open", "files": []})
         if (method, path) == ("POST", "/uploads/up-1/commit"):
             return self.commit_answer or ok({"id": "scan-1", "name": "teapot"}, 201)
         if (method, path) == ("DELETE", "/uploads/up-1"):
@@ -226,7 +228,8 @@ def splatct(tmp_path: Path) -> Run:
     def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
         path = os.pathsep.join([str(info.parent), str(ROOT / "client")])
         env = {name: value for name, value in os.environ.items() if not name.startswith("SPLATCT_")}
-        env |= {"PYTHONPATH": path, "PYTHONIOENCODING": "utf-8", **environment}
+        env |= {"PYTHONPATH": path, "PYTHONIOENCODING": "utf-8", "XDG_STATE_HOME": str(tmp_path / "state")}
+        env |= environment
         command = [sys.executable, "-m", "splatct_client", *arguments]
         return subprocess.run(command, env=env, capture_output=True, text=True, encoding="utf-8", timeout=60)
 

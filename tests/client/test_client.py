@@ -16,8 +16,8 @@ from splatct_client import (
     ServerUnreachable,
     UnexpectedAnswer,
 )
+from splatct_client.following import watch
 from splatct_client.retry import Patience
-from splatct_client.verbs.submit import watch
 
 JOB_ID = "6a1f6f0e-0000-4000-8000-000000000001"
 

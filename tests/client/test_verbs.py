@@ -24,7 +24,7 @@ def free_address() -> str:
 def test_help_lists_every_verb(splatct):
     done = splatct("--help")
     assert done.returncode == 0
-    for verb in ("submit", "jobs", "fetch", "cancel"):
+    for verb in ("submit", "send", "import", "jobs", "fetch", "cancel", "restart", "webhooks"):
         assert f"\n  {verb} " in done.stdout
     assert "exit codes" in done.stdout
 

@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatcore.calibration import Calibration
 from splatcore.descent import Descent, Rates
+from splatcore.errors import ReconstructionError
+from splatcore.gate import Decision
 from splatcore.options import Options
 from splatcore.progress import Progress
 from splatcore.pyramid import level
 from splatcore.reconstruct import drain, reconstruct
 from splatcore.reconstruction import Reconstruction
-from splatcore.refine import MOVING, WEIGHTS, Weighing, refine
+from splatcore.refine import MOVING, WEIGHTS, Refinement, Weighing, refine
 from splatcore.scan import Scan, read_scan
 from splatcore.scores import psnr
 from splatcore.simulate import Simulation, simulate
@@ -81,6 +84,35 @@ def test_the_choice_is_the_better_volume(sharp_result, monkeypatch):
     plain = drain(reconstruct(scan, FIXED))
     truth = sharp() * np.float32(0.01)
     assert psnr(chosen.volume, truth, 0.01) > psnr(plain.volume, truth, 0.01) + 0.5
+
+
+def test_a_loss_that_is_no_number_ends_the_last_stage(sharp_result, monkeypatch):
+    """As it does the levels before."""
+    descent, here = descent_of(sharp_result[0]), level(sharp_result[0], 1)
+    branch = Refinement(descent, here, np.arange(4), 0.0, np.random.default_rng(0))
+    measure, calls = Descent.differentiate, []
+
+    def spoiled(self, *given):
+        calls.append(1)
+        return np.nan if len(calls) == 3 else measure(self, *given)
+
+    monkeypatch.setattr(Descent, "differentiate", spoiled)
+    with pytest.raises(ReconstructionError, match="the loss became nan in the last stage, step 4"):
+        list(branch.run(here.nominal, 20))
+
+
+@pytest.mark.parametrize("freedom", ["gate", "option"])
+def test_no_sigma_is_stated_where_no_view_was_moved(sharp_result, freedom):
+    """Whether the option said so, or views left out did."""
+    scan, result, _ = sharp_result
+    assert np.isnan(result.sigma_rotation_deg).all() and np.isnan(result.sigma_translation_mm).all()
+    options = Options(calibrate="none" if freedom == "option" else "full", threads=1)
+    calibration = Calibration(scan, options)
+    calibration.decision = Decision("none", calibration.motions) if freedom == "gate" else None
+    here = level(scan, 1)
+    calibration.normals = calibration.accumulate(here, descent_of(scan))
+    sigma = calibration.sigmas(here, descent_of(scan), scan.frames)
+    assert all(np.isnan(one).all() for one in sigma)
 
 
 @pytest.mark.slow

@@ -116,6 +116,15 @@ def test_poses_file(tmp_path: Path) -> None:
     assert "notes" not in poses
 
 
+def test_no_sigma_is_stated_of_views_that_were_not_moved(tmp_path: Path) -> None:
+    unmoved = np.full((VIEWS, 3), np.nan)
+    write_results(reconstruction("cone", sigma_rotation_deg=unmoved, sigma_translation_mm=unmoved), tmp_path)
+    poses = json.loads((tmp_path / "poses.json").read_text())
+    nothing = {"rotation_deg": [None] * 3, "translation_mm": [None] * 3}
+    assert all(view["sigma"] == nothing for view in poses["views"])
+    assert len(poses["notes"]) == 1 and "no view was moved" in poses["notes"][0]
+
+
 def test_infinite_sigma_is_null_with_a_note(tmp_path: Path) -> None:
     sigma = np.ones((VIEWS, 3))
     sigma[:, 0] = np.inf
@@ -125,7 +134,7 @@ def test_infinite_sigma_is_null_with_a_note(tmp_path: Path) -> None:
     poses = json.loads(text)
     assert poses["views"][0]["sigma"]["translation_mm"] == [None, 1.0, 1.0]
     assert poses["views"][0]["residual_rms"] is None
-    assert "sigma null" in poses["notes"][0]
+    assert len(poses["notes"]) == 1 and "does not show" in poses["notes"][0]
     assert read_results(tmp_path).frames.beam == "parallel"
 
 

@@ -31,6 +31,8 @@ class Stage:
 
     data: Path
     url: str = ""
+    stop: Callable[[], None] = lambda: None  # the server
+    start_again: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
         (self.data / "jobs").mkdir(parents=True, exist_ok=True)

@@ -32,6 +32,11 @@ def run(verb: types.ModuleType, *arguments: str) -> int:
     return int(verb.run(parser.parse_args(arguments)))
 
 
+@pytest.fixture(autouse=True)
+def state(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+
+
 @pytest.fixture
 def scan(tmp_path: Path) -> Path:
     folder = tmp_path / "Prüfling 7"

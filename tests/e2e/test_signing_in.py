@@ -9,8 +9,10 @@ from playwright.sync_api import Browser, Page, expect
 
 from server.keys import KeyRing, Scope
 
+from .chromium import NEEDED
 from .stage import Stage
-from .test_status_page import browser, pytestmark  # noqa: F401
+
+pytestmark = NEEDED
 
 
 @pytest.fixture
@@ -19,7 +21,7 @@ def key(stage: Stage) -> str:
 
 
 @pytest.fixture
-def page(browser: Browser, stage: Stage, key: str) -> Iterator[Page]:  # noqa: F811
+def page(browser: Browser, stage: Stage, key: str) -> Iterator[Page]:
     context = browser.new_context(base_url=stage.url)
     page = context.new_page()
     failed: list[str] = []

@@ -109,7 +109,17 @@ class Stack:
         }
         self._log = (folder / "log.txt").open("ab")
         self._processes: list[subprocess.Popen[bytes]] = []
-        self.http = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", trust_env=False, timeout=30)
+        self._hooks = {"response": [self._tells_no_path]}
+        base_url = f"http://127.0.0.1:{self.port}"
+        self.http = httpx.Client(base_url=base_url, trust_env=False, timeout=30, event_hooks=self._hooks)
+
+    def _tells_no_path(self, response: httpx.Response) -> None:
+        """Whatever a test asks for: no answer says where things lie on the server."""
+        kind = response.headers.get("content-type", "").partition(";")[0]
+        if kind in ("application/json", "application/problem+json", "text/plain"):
+            response.read()
+            for place in (self.data, ROOT, Path(sys.prefix)):
+                assert str(place) not in response.text, (response.request.url, response.text)
 
     def new_key(self, tenant: str, *scopes: str, expires_at: float | None = None) -> tuple[Key, str]:
         """As `splatct keys add` makes one, while the server runs."""
@@ -127,7 +137,8 @@ class Stack:
     def client(self, key: str | None = None) -> httpx.Client:
         """Closed by whoever asked for it."""
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
-        return httpx.Client(base_url=str(self.http.base_url), headers=headers, trust_env=False, timeout=30)
+        base_url = str(self.http.base_url)
+        return httpx.Client(base_url=base_url, headers=headers, trust_env=False, timeout=30, event_hooks=self._hooks)
 
     def __enter__(self) -> Self:
         self.redis.start()

@@ -222,7 +222,7 @@ def test_a_worker_is_seen_again_after_redis_was_wiped(stack: Stack) -> None:
     stack.until(lambda: stack.http.get("/readyz").status_code == 200, what="a worker")
     with Redis.from_url(stack.redis.url) as redis:
         redis.flushall()
-    assert stack.http.get("/readyz").status_code == 503
+    stack.until(lambda: stack.http.get("/readyz").status_code == 503, 3, "the worker out of sight")
     stack.until(lambda: stack.http.get("/readyz").status_code == 200, 30, "the worker again")
 
 

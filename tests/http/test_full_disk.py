@@ -128,7 +128,7 @@ def test_below_the_floor_uploads_are_refused_and_deletions_are_not(disk: TinyDis
         assert stack.http.get("/readyz").json()["disk"] is False
         assert stack.http.delete(f"/v1/scans/{scan}").status_code == 204
         disk.empty()
-        assert stack.http.get("/readyz").json()["disk"] is True
+        stack.until(lambda: stack.http.get("/readyz").json()["disk"] is True, 3, "room again")
         commit(stack.http, scan_files())
 
 

@@ -40,6 +40,21 @@ def test_the_queue_and_its_list(http: httpx.Client) -> None:
     assert http.get("/v1/jobs?state=queued").json()["jobs"] == []
 
 
+def test_a_waiting_job_gets_another_place(http: httpx.Client) -> None:
+    scan_id = commit(http, scan_files())
+    first, second = submit(http, scan_id), submit(http, scan_id)
+    changed = http.patch(f"/v1/jobs/{second}", json={"priority": "high"})
+    assert changed.status_code == 200
+    assert (changed.json()["priority"], changed.json()["queue_position"]) == ("high", 1)
+    assert http.get(f"/v1/jobs/{first}").json()["queue_position"] == 2
+    assert http.patch(f"/v1/jobs/{second}", json={"priority": "highest"}).status_code == 422
+    assert http.patch(f"/v1/jobs/{uuid4()}", json={"priority": "low"}).status_code == 404
+    for job_id in (first, second):
+        http.post(f"/v1/jobs/{job_id}/cancel")
+    finished = http.patch(f"/v1/jobs/{first}", json={"priority": "low"})
+    assert finished.status_code == 409 and finished.json()["type"] == "urn:splatct:problem:finished"
+
+
 def test_a_queued_job_cannot_be_deleted_a_cancelled_one_can(http: httpx.Client, idle: Stack) -> None:
     job_id = submit(http, commit(http, scan_files()))
     assert http.delete(f"/v1/jobs/{job_id}").status_code == 409
@@ -98,6 +113,7 @@ def test_unknown_ids_cover_every_route(http: httpx.Client) -> None:
     file = "/v1/uploads/{upload_id}/files/{name}"
     elsewhere = {(method, file) for method in ("HEAD", "PATCH", "OPTIONS")}  # test_resume.py: no JSON, other headers
     elsewhere |= {("POST", "/v1/uploads/{upload_id}/files")}  # test_growing.py: needs a body
+    elsewhere |= {("PATCH", "/v1/jobs/{job_id}")}  # below, likewise
     assert with_id >= makes_one | elsewhere
     assert len(with_id - makes_one - elsewhere) == len(UNKNOWN)
 

@@ -1,100 +1,21 @@
-"""How much, how often and how large: quotas of a tenant, rates of a key, sizes of a request."""
+"""How often and how large: rates of a key, sizes of a request. Quotas are in test_quotas.py."""
 
 from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from uuid import uuid4
 
-import httpx
 import pytest
 
 from server.limits import HEAD_BYTES
 from server.rates import Buckets, neighbourhood
 
-from .stack import Stack, announce, commit, scan_files, send, submit
+from .stack import Stack, scan_files, send
 
 NOBODY_S = "5f0c1d9e-0000-4000-8000-000000000000"  # id of nothing
 
 FILES = scan_files()
-SIZE = sum(map(len, FILES.values()))
-BODY = {"name": "s", "files": [{"name": name, "size": len(data)} for name, data in FILES.items()]}
-
-
-@pytest.fixture(scope="module")
-def narrow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
-    """Room for three scans and two jobs a tenant, five requests at once and one a second a key. No worker."""
-    running = Stack(tmp_path_factory.mktemp("narrow"))
-    running.environment |= {
-        "SPLATCT_TENANT_GIB": str(3.5 * SIZE / (1 << 30)),
-        "SPLATCT_TENANT_JOBS": "2",
-        "SPLATCT_RATE_PER_S": "0",
-        "SPLATCT_FAILURES_PER_MIN": "6",
-    }
-    with running:
-        yield running
-
-
-@pytest.fixture
-def tenant(narrow: Stack) -> Iterator[httpx.Client]:
-    """A client of a tenant that has nothing yet."""
-    with narrow.client(narrow.new_key(f"t-{uuid4().hex[:8]}", "admin")[1]) as http:
-        yield http
-
-
-def test_bytes_are_taken_when_an_upload_is_announced_and_given_back(tenant: httpx.Client) -> None:
-    uploads = [announce(tenant, FILES)["id"] for _ in range(2)] + [send(tenant, FILES)]
-    scan_id = tenant.post(f"/v1/uploads/{uploads[2]}/commit").json()["id"]
-    full = tenant.post("/v1/uploads", json=BODY)
-    assert full.status_code == 507 and full.json()["type"] == "urn:splatct:problem:quota-exceeded"
-    limit = round(3.5 * SIZE)
-    assert f"{SIZE} bytes are asked for; {3 * SIZE} of {limit} are taken" in full.json()["errors"][0]["what"]
-    usage = tenant.get("/v1/usage").json()
-    assert usage == {"bytes": {"used": 3 * SIZE, "limit": limit}, "active_jobs": {"used": 0, "limit": 2}}
-    tenant.delete(f"/v1/uploads/{uploads[0]}")
-    announce(tenant, FILES)
-    assert tenant.post("/v1/uploads", json=BODY).status_code == 507
-    tenant.delete(f"/v1/scans/{scan_id}")
-    announce(tenant, FILES)
-
-
-def test_what_can_never_fit_is_another_answer(tenant: httpx.Client) -> None:
-    body = {"name": "s", "files": [{"name": "scan.json", "size": 4 * SIZE}]}
-    answer = tenant.post("/v1/uploads", json=body)
-    assert answer.status_code == 413 and f"{4 * SIZE} bytes together" in answer.json()["errors"][0]["what"]
-    assert tenant.get("/v1/usage").json()["bytes"]["used"] == 0
-
-
-def test_of_uploads_at_once_no_more_than_fit_are_taken(tenant: httpx.Client) -> None:
-    with ThreadPoolExecutor(8) as pool:
-        answers = list(pool.map(lambda _: tenant.post("/v1/uploads", json=BODY).status_code, range(16)))
-    assert sorted(answers) == [201] * 3 + [507] * 13
-
-
-def test_a_tenant_s_jobs_at_a_time(narrow: Stack, tenant: httpx.Client) -> None:
-    scan_id = commit(tenant, FILES)
-    with ThreadPoolExecutor(8) as pool:
-        answers = list(pool.map(lambda _: tenant.post("/v1/jobs", json={"scan_id": scan_id}), range(8)))
-    assert sorted(answer.status_code for answer in answers) == [202] * 2 + [429] * 6
-    refused = tenant.put(f"/v1/jobs/{uuid4()}", json={"scan_id": scan_id})
-    assert refused.status_code == 429 and int(refused.headers["retry-after"]) > 0
-    assert "2 are queued or running, 2 may be" in refused.json()["errors"][0]["what"]
-    assert not list((narrow.data / "jobs").glob(".new-*")), "nothing is left of what was refused"
-    with narrow.client(narrow.new_key("another", "admin")[1]) as another:
-        submit(another, commit(another, FILES))
-    first = next(answer.json()["id"] for answer in answers if answer.status_code == 202)
-    tenant.post(f"/v1/jobs/{first}/cancel")
-    submit(tenant, scan_id)
-
-
-def test_a_repeated_submission_needs_no_second_place(tenant: httpx.Client) -> None:
-    scan_id, job_id = commit(tenant, FILES), uuid4()
-    submit(tenant, scan_id)
-    answers = [tenant.put(f"/v1/jobs/{job_id}", json={"scan_id": scan_id}).status_code for _ in range(2)]
-    assert answers == [202, 202]
 
 
 def test_a_key_that_asks_too_often_is_told_when_to_come_back(stack: Stack) -> None:
@@ -114,9 +35,11 @@ def test_a_key_that_asks_too_often_is_told_when_to_come_back(stack: Stack) -> No
         assert fast.get("/v1/jobs").status_code == 200
 
 
-def test_trying_keys_is_slowed_down_and_locks_nobody_out(narrow: Stack) -> None:
-    _, good = narrow.new_key("a", "read")
-    with narrow.client() as http:
+def test_trying_keys_is_slowed_down_and_locks_nobody_out(tmp_path: Path) -> None:
+    running = Stack(tmp_path)
+    running.environment["SPLATCT_FAILURES_PER_MIN"] = "6"
+    with running, running.client() as http:
+        _, good = running.new_key("a", "read")
         tried = [http.post("/v1/session", json={"key": f"splatct_aaaaaaaaaa_{n}"}) for n in range(8)]
         assert [answer.status_code for answer in tried] == [401] * 6 + [429] * 2
         assert 0 < int(tried[7].headers["retry-after"]) <= 10

@@ -10,7 +10,7 @@ import httpx
 import pytest
 from splatct_client.client import Client
 from splatct_client.scanfolder import read_scan_folder
-from splatct_client.verbs.submit import send
+from splatct_client.sending import send
 
 from server.settings import Settings, SettingsError
 

@@ -7,6 +7,7 @@ import socket
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,9 @@ from worker.journal import Cursor, EventWriter
 from .stack import Stack, commit, scan_files, submit
 
 
-def sse(http: httpx.Client, job_id: str, **headers: str) -> Iterator[dict[str, str]]:
+def sse(http: httpx.Client, job_id: str, query: str = "", **headers: str) -> Iterator[dict[str, str]]:
     """The fields of each event until the server ends the stream."""
-    with http.stream("GET", f"/v1/jobs/{job_id}/events/stream", headers=headers) as answer:
+    with http.stream("GET", f"/v1/jobs/{job_id}/events/stream{query}", headers=headers) as answer:
         assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/event-stream")
         fields: dict[str, str] = {}
         for line in answer.iter_lines():
@@ -59,6 +60,19 @@ def test_a_reader_that_comes_back_gets_what_it_missed(shared: Stack) -> None:
     for number in (0, 2, int(everything[-1]["id"])):
         again = list(sse(shared.http, job_id, **{"Last-Event-ID": str(number)}))
         assert again == [event for event in everything if "event" in event or int(event["id"]) > number]
+
+
+def test_the_job_itself_is_told_where_it_is_asked_for(shared: Stack) -> None:
+    """Its state as it is, then each change; without a number, so that no event is missed by who comes back."""
+    job_id = submit(shared.http, commit(shared.http, scan_files(steps=4, pause=0.4)))
+    told = list(sse(shared.http, job_id, query="?job=true"))
+    rows = [event for event in told if event.get("event") == "job"]
+    jobs = [json.loads(event["data"]) for event in rows]
+    assert all("id" not in event for event in rows) and {job["id"] for job in jobs} == {job_id}
+    assert jobs[-1]["state"] == "running" and len({job["progress"] for job in jobs}) >= 2
+    assert all(one != other for one, other in pairwise(jobs)), "each is news"
+    events = [event for event in told if event.get("event") != "job"]
+    assert events == list(sse(shared.http, job_id)), "all else is as without"
 
 
 @pytest.mark.parametrize("value", ["x", "-1", "1.5"])

@@ -38,6 +38,7 @@ FOREIGN = [
     "DELETE /v1/scans/{scan_id}",
     "PUT /v1/jobs/{job_id}",
     "GET /v1/jobs/{job_id}",
+    "PATCH /v1/jobs/{job_id}",
     "POST /v1/jobs/{job_id}/restart",
     "POST /v1/jobs/{job_id}/pin",
     "DELETE /v1/jobs/{job_id}/pin",
@@ -87,7 +88,9 @@ class Two:
         more: dict[str, Any] = {}
         if method == "PUT" and "uploads" in path:
             more["content"] = b"x"
-        if method == "PATCH":
+        if method == "PATCH" and "jobs" in path:
+            more["json"] = {"priority": "high"}
+        elif method == "PATCH":
             more = {
                 "content": b"x",
                 "headers": {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"},

@@ -79,14 +79,14 @@ def test_of_submissions_at_once_one_makes_the_job(database: Database, kind: Kind
 
 
 def test_of_uploads_at_once_no_more_than_fit_the_quota_are_taken(database: Database) -> None:
-    quotas, together = Quotas(35, 2), threading.Barrier(6)
+    quotas, together = Quotas(35, 2, 0), threading.Barrier(6)
     stores = {tenant: Store(database, tenant) for tenant in ("a", "b")}
 
     def announce(number: int) -> bool:
         tenant = "ab"[number % 2]
         together.wait()
         try:
-            stores[tenant].add_upload("scan", [File("scan.json", 10, None, None)], quotas.room_for(tenant, 10))
+            stores[tenant].add_upload("scan", [File("scan.json", 10, None, None)], quotas.upload(tenant, 10))
         except ApiProblem:
             return False
         return True
@@ -103,7 +103,7 @@ def test_of_jobs_at_once_no_more_than_the_quota_are_queued(database: Database) -
     def submit(number: int) -> bool:
         together.wait()
         try:
-            return store.add_job(NewJob(str(number), "job", {}), scan, lambda: None, quotas.place_for("a"))
+            return store.add_job(NewJob(str(number), "job", {}), scan, lambda: None, quotas.job("a", 0))
         except ApiProblem:
             return False
 

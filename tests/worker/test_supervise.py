@@ -138,7 +138,7 @@ def test_a_killed_engine_is_tried_again_but_not_for_ever(run: Run, new_job: NewJ
     job = run(job)
     assert (job.state, job.error_kind) == (State.FAILED, ErrorKind.CRASHED)
     message = job.error_message or ""
-    assert "SIGKILL" in message and "environment: " in message  # the end of its log
+    assert "SIGKILL" in message and "environment: " not in message  # the log has that, and is not for everybody
 
 
 def test_an_engine_that_gets_further_each_time_is_not_given_up(

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from splatct_client.errors import InputError, JobFailed
+from splatct_client.following import end_text, watch
 from splatct_client.verbs import add_server_option, connect, print_json
-from splatct_client.verbs.submit import end_text, watch
 
 HELP = "download a job's results, checked against their sha256"
 

@@ -7,7 +7,7 @@ import json
 from typing import TYPE_CHECKING
 
 from splatct_client.bar import seconds_text
-from splatct_client.verbs import add_server_option, connect, print_json
+from splatct_client.verbs import add_server_option, connect, print_json, table
 
 if TYPE_CHECKING:
     from splatct_client.models import Job
@@ -47,12 +47,8 @@ def _count(text: str) -> int:
 
 
 def _table(jobs: list[Job]) -> str:
-    rows = [("JOB", "STATE", "DONE", "CREATED", "NAME")]
-    rows += [(j.id, j.state, f"{j.progress:.0%}", (j.created_at or "")[:19], j.name or j.scan_name) for j in jobs]
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    return "\n".join(
-        "  ".join([*(cell.ljust(w) for cell, w in zip(row, widths, strict=False)), row[4]]) for row in rows
-    )
+    rows = [(j.id, j.state, f"{j.progress:.0%}", (j.created_at or "")[:19], j.name or j.scan_name) for j in jobs]
+    return table(("JOB", "STATE", "DONE", "CREATED", "NAME"), rows)
 
 
 def _card(job: Job) -> str:
@@ -66,6 +62,9 @@ def _card(job: Job) -> str:
         "doing": job.message,
         "left": None if job.eta_s is None else seconds_text(job.eta_s),
         "attempt": str(job.attempt) if job.attempt > 1 else None,
+        "priority": job.priority if job.priority != "normal" else None,
+        "restarts": job.restart_of,
+        "pinned": "yes" if job.pinned else None,
         "options": json.dumps(job.options, ensure_ascii=False),
         "created": job.created_at,
         "started": job.started_at,
