@@ -10,6 +10,8 @@ import socket
 import subprocess
 import sys
 import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -22,6 +24,8 @@ from splatct_client.verbs.submit import send
 
 from server.redisserver import OwnRedis
 from splatcore.simulate import Simulation, simulate
+from worker.jobfolder import JobFolder
+from worker.lifeline import before_exec
 
 _AGAIN_S = 1.0  # after a death
 CHECKPOINT_S = 1.0
@@ -30,10 +34,10 @@ _OPTIONS = {"quality": "preview", "calibrate": "full", "splats": 1500, "threads"
 
 
 class Part:
-    """One process of the service, started again when it died."""
+    """One process of the service, started again when it died. It dies with this process."""
 
-    def __init__(self, module: str, environment: dict[str, str], log: Path) -> None:
-        self._module, self._environment, self._log = module, environment, log
+    def __init__(self, command: Sequence[str], environment: dict[str, str], log: Path) -> None:
+        self._command, self._environment, self._log = command, environment, log
         self._process: subprocess.Popen[bytes] | None = None
         self._died_at = 0.0
 
@@ -49,9 +53,10 @@ class Part:
         if self._process is not None and self._process.poll() is not None:
             self._process, self._died_at = None, time.monotonic()
         if self._process is None and time.monotonic() - self._died_at >= _AGAIN_S:
-            command = [sys.executable, "-P", "-m", self._module, "--tie-to", str(os.getpid())]
             with self._log.open("ab") as log:
-                self._process = subprocess.Popen(command, env=self._environment, stdout=log, stderr=log)
+                self._process = subprocess.Popen(
+                    self._command, env=self._environment, stdout=log, stderr=log, preexec_fn=before_exec(signal.SIGKILL)
+                )
 
     def signal(self, which: signal.Signals) -> None:
         if self._process is not None:
@@ -67,7 +72,7 @@ class Part:
 class Service:
     """Use it in `with`; call `tend` often."""
 
-    def __init__(self, folder: Path, workers: int) -> None:
+    def __init__(self, folder: Path, workers: int, settings: Mapping[str, str] | None = None) -> None:
         self.data, self.log = folder / "data", folder / "log.txt"
         self.data.mkdir(parents=True)
         self.redis = OwnRedis(folder / "redis")
@@ -82,9 +87,11 @@ class Service:
             "SPLATCT_CHECKPOINT_S": str(CHECKPOINT_S),
             "SPLATCT_TEST_MODE": "1",
             "SPLATCT_TEST_STEP_S": str(_STEP_S),
+            **(settings or {}),
         }
-        self.server = Part("server", environment, self.log)
-        self.workers = [Part("worker", environment, self.log) for _ in range(workers)]
+        python = [sys.executable, "-P", "-m"]
+        self.server = Part([*python, "server"], environment, self.log)
+        self.workers = [Part([*python, "worker"], environment, self.log) for _ in range(workers)]
         self.url = f"http://127.0.0.1:{self._port}"
         self._client = Client(self.url)
         self._scan = ""
@@ -129,6 +136,15 @@ class Service:
         path = f"http://127.0.0.1:{self._port}/v1/jobs/{job_id}/events"
         return list(httpx.get(path, timeout=10, trust_env=False).raise_for_status().json()["events"])
 
+    def published(self) -> Counter[str]:
+        said = (line for line in self.log.read_text(errors="replace").splitlines() if "published its results" in line)
+        return Counter(word.strip(":") for line in said for word in line.split() if word.endswith(":"))
+
+    def kept_ago(self, job_id: str) -> float | None:
+        with contextlib.suppress(FileNotFoundError):
+            return time.time() - JobFolder(self.data, job_id).checkpoint.stat().st_mtime
+        return None
+
     def engines(self) -> dict[str, int]:
         """The engine process of each job at work, from the kernel's own list."""
         found = {}
@@ -145,11 +161,11 @@ class Service:
         """What a worker is at: its engine is its grandchild."""
         for job_id, pid in self.engines().items():
             with contextlib.suppress(OSError):
-                if worker.pid in (parent := _parent(pid), _parent(parent)):
+                if worker.pid in (parent := parent_of(pid), parent_of(parent)):
                     return job_id
         return None
 
-    def until(self, condition: Any, seconds: float, what: str) -> None:
+    def until(self, condition: Callable[[], bool], seconds: float, what: str) -> None:
         deadline = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > deadline:
@@ -158,5 +174,5 @@ class Service:
             time.sleep(0.1)
 
 
-def _parent(pid: int) -> int:
+def parent_of(pid: int) -> int:
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
