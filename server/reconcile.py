@@ -70,7 +70,7 @@ class Reconciler:
         elif folder.published():
             self._ledger.succeed(job.id, job.attempt)
         else:
-            end = self._ledger.crashed(job, "The worker died", folder.advanced(), folder.log_tail())
+            end = self._ledger.crashed(job, "The worker died", folder.advanced(), folder.log_tail(), by_others=True)
             if end is State.FAILED:
                 folder.tidy()
 

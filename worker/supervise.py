@@ -267,8 +267,8 @@ class _Attempt:
         elif code == -signal.SIGKILL and not self._killed_by_us and self._memory.killed():
             ledger.fail(job.id, job.attempt, ErrorKind.OUT_OF_MEMORY, _OUT_OF_MEMORY)
         else:
-            folder = self._folder
-            end = ledger.crashed(job, _obituary(code), advanced=folder.advanced(), log_tail=folder.log_tail())
+            folder, by_others = self._folder, code == -signal.SIGKILL and not self._killed_by_us
+            end = ledger.crashed(job, _obituary(code), folder.advanced(), folder.log_tail(), by_others)
             if end is not State.FAILED:
                 return
         self._folder.tidy()

@@ -26,6 +26,7 @@ import rq
 from redis import Redis
 from redis.exceptions import RedisError
 from rq import Queue, Retry
+from rq.exceptions import NoSuchJobError
 from rq.job import Job
 
 from bench.faults.plainjob import work
@@ -141,15 +142,13 @@ class PlainRQ:
     def jobs(self) -> dict[str, dict[str, Any]] | None:
         """What has a result is done, whatever the queue says; of the rest the queue knows, or nobody."""
         try:
-            known = {i: job for i, job in zip(self._ids, Job.fetch_many(self._ids, self._connection), strict=True)}
-            states = {i: job.get_status() for i, job in known.items() if job is not None}
+            words = {job_id: self._word(job_id) for job_id in self._ids}
         except RedisError:
             return None
         at_work = self.engines()
         found = {}
         for job_id in self._ids:
-            state = states.get(job_id)
-            word = "unknown" if state is None else str(state.value)
+            word = words[job_id]
             if self._told.get(job_id) != "finished":  # which it forgets after a while, as it should
                 self._told[job_id] = word
             attempts = max(len(_attempts(self._journal(job_id))), 1)
@@ -163,6 +162,13 @@ class PlainRQ:
             else:  # `started` without a process that does it, too
                 found[job_id] = {"state": word, "attempt": attempts, "error": None}
         return found
+
+    def _word(self, job_id: str) -> str:
+        """What the queue says of a job. A wipe may leave a record with nothing in it but a heartbeat."""
+        try:
+            return str(Job.fetch(job_id, self._connection).get_status().value)
+        except NoSuchJobError:
+            return "unknown"
 
     def misreported(self) -> list[str]:
         """Jobs whose result is there, and of which the queue never said so."""

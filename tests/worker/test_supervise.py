@@ -130,15 +130,22 @@ def test_events_that_do_not_fit_cost_the_run_nothing(
     assert run(new_job(steps=4)).state is State.SUCCEEDED
 
 
-def test_a_killed_engine_is_tried_again_but_not_for_ever(run: Run, new_job: NewJob, tmp_path: Path) -> None:
-    job = new_job(end="killed", steps=0)
+def test_an_engine_that_dies_is_tried_again_but_not_for_ever(run: Run, new_job: NewJob, tmp_path: Path) -> None:
+    job = new_job(end="segfault", steps=0)
     for attempt in range(2, MAX_CRASHES + 1):
         job = run(job)
         assert (job.state, job.attempt) == (State.QUEUED, attempt)
     job = run(job)
     assert (job.state, job.error_kind) == (State.FAILED, ErrorKind.CRASHED)
     message = job.error_message or ""
-    assert "SIGKILL" in message and "environment: " in message  # the end of its log
+    assert "SIGSEGV" in message and "environment: " in message  # the end of its log
+
+
+def test_an_engine_that_something_else_kills_is_not_given_up_so_soon(run: Run, new_job: NewJob) -> None:
+    job = new_job(end="killed", steps=0)
+    for attempt in range(2, MAX_CRASHES + 3):
+        job = run(job)
+        assert (job.state, job.attempt, job.crashes) == (State.QUEUED, attempt, attempt - 1)
 
 
 def test_an_engine_that_gets_further_each_time_is_not_given_up(
