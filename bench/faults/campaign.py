@@ -24,6 +24,7 @@ _UNDER_WAY = ("queued", "running", "cancelling")
 _PAUSE_S = (0.5, 3.0)  # between two faults
 _WAITING = 3  # jobs that are kept waiting or at work, for each worker
 _WATCH_S = 15.0  # a victim of a kill is waited for so long before the next fault; its recovery counts later, too
+_IDLE_S = 180.0  # of all workers, which is no fault to count but a campaign that strikes at nothing
 END_S = 600.0  # after the last fault: a job that has not ended by then is stuck
 
 
@@ -197,7 +198,7 @@ class Campaign:
 
     def _kill_at_work(self, kind: str) -> None:
         """A worker that has a job, or an engine; whichever there is first."""
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + _IDLE_S
         while time.monotonic() < deadline:
             self._live(0.05)
             jobs, engines = self._service.jobs() or {}, self._service.engines()
@@ -219,7 +220,7 @@ class Campaign:
             if kept_ago is not None:
                 self._kept_ago[job_id, attempt] = kept_ago
             return
-        raise TimeoutError("no worker had a job for 30 s: there is nothing to kill")
+        raise TimeoutError(f"no worker had a job for {_IDLE_S:.0f} s: there is nothing to kill")
 
     def _all_ended(self) -> bool:
         jobs = self._service.jobs()

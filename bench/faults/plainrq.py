@@ -142,6 +142,7 @@ class PlainRQ:
     def jobs(self) -> dict[str, dict[str, Any]] | None:
         """What has a result is done, whatever the queue says; of the rest the queue knows, or nobody."""
         try:
+            in_line = set(self._queue.get_job_ids())
             words = {job_id: self._word(job_id) for job_id in self._ids}
         except RedisError:
             return None
@@ -159,8 +160,9 @@ class PlainRQ:
             elif word == "unknown" or word in _ENDED_BADLY:
                 error = {"message": f"the queue says: {word}"}
                 found[job_id] = {"state": "failed", "attempt": attempts, "error": error}
-            else:  # `started` without a process that does it, too
-                found[job_id] = {"state": word, "attempt": attempts, "error": None}
+            else:  # `started` without a process that does it, too, and `queued` without a place in the queue
+                state = "out of line" if word == "queued" and job_id not in in_line else word
+                found[job_id] = {"state": state, "attempt": attempts, "error": None}
         return found
 
     def _word(self, job_id: str) -> str:
