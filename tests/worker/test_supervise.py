@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import signal
+import sqlite3
 import threading
 import time
 import zipfile
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy.exc import OperationalError
 
 from worker.contract import MAX_CRASHES, ErrorKind, State
 from worker.jobfolder import JobFolder
@@ -121,6 +123,33 @@ def test_another_error_around_the_engine_is_no_full_disk(
         run(job)
     found = ledger.get(job.id)
     assert found is not None and found.state is State.RUNNING, "the reconcile loop will judge"
+
+
+@pytest.mark.parametrize(
+    ("plan", "method", "state"),
+    [
+        ({}, "succeed", State.SUCCEEDED),
+        ({"end": "full"}, "fail", State.FAILED),
+        ({"end": "killed"}, "crashed", State.QUEUED),
+    ],
+    ids=["success", "failure", "death"],
+)
+def test_an_end_that_the_database_has_no_room_for_is_recorded_when_it_has(
+    run: Run, new_job: NewJob, monkeypatch: pytest.MonkeyPatch, plan: dict[str, Any], method: str, state: State
+) -> None:
+    monkeypatch.setattr("worker.supervise.time.sleep", lambda _: None)
+    record, refused = getattr(Ledger, method), []
+
+    def full(*given: Any, **named: Any) -> Any:
+        if len(refused) < 3:
+            refused.append(method)
+            raise OperationalError("UPDATE jobs", {}, sqlite3.OperationalError("database or disk is full"))
+        return record(*given, **named)
+
+    monkeypatch.setattr(Ledger, method, full)
+    job = run(new_job(**plan))
+    assert (job.state, len(refused)) == (state, 3)
+    assert (job.error_kind == ErrorKind.DISK_FULL) == (state is State.FAILED)
 
 
 def test_events_that_do_not_fit_cost_the_run_nothing(
