@@ -117,7 +117,8 @@ def test_a_download_of_what_is_deleted_ends_whole(stack: Stack) -> None:
         assert answer.status_code == 200
         for chunk in answer.iter_raw(1 << 20):
             if not seen:
-                assert stack.client().delete(f"/v1/jobs/{job_id}").status_code == 204
+                with stack.client() as other:
+                    assert other.delete(f"/v1/jobs/{job_id}").status_code == 204
             digest.update(chunk)
             seen += len(chunk)
     assert (seen, digest.hexdigest()) == (largest["size"], largest["sha256"])
@@ -156,18 +157,22 @@ def test_at_the_edge_of_a_quota_none_is_ever_over_it(tmp_path: Path) -> None:
     with stack:
         scan_id = commit(stack.http, FILES)
         listed = [{"name": name, "size": len(data)} for name, data in FILES.items()]
-        until, over, taken = time.monotonic() + 6, [], {"upload": 0, "grown": 0, "job": 0}
+        began, over, taken = time.monotonic(), [], {"upload": 0, "grown": 0, "job": 0}
+
+        def going_on() -> bool:
+            seconds = time.monotonic() - began
+            return seconds < 6 or (seconds < 60 and min(taken.values()) < 10)
 
         def watch() -> None:
             with stack.client() as http:
-                while time.monotonic() < until:
+                while going_on():
                     usage = http.get("/v1/usage").json()
                     if usage["bytes"]["used"] > limit or usage["active_jobs"]["used"] > most_jobs:
                         over.append(usage)
 
         def upload(grows: bool) -> None:
             with stack.client() as http:
-                while time.monotonic() < until:
+                while going_on():
                     body = {"name": "s", "files": [] if grows else listed, "growing": grows}
                     made = http.post("/v1/uploads", json=body)
                     if made.status_code == 201 and grows:
@@ -181,7 +186,7 @@ def test_at_the_edge_of_a_quota_none_is_ever_over_it(tmp_path: Path) -> None:
 
         def job(put: bool) -> None:
             with stack.client() as http:
-                while time.monotonic() < until:
+                while going_on():
                     body = {"scan_id": scan_id}
                     made = http.put(f"/v1/jobs/{uuid4()}", json=body) if put else http.post("/v1/jobs", json=body)
                     assert made.status_code in (202, 429), made.text
@@ -196,7 +201,7 @@ def test_at_the_edge_of_a_quota_none_is_ever_over_it(tmp_path: Path) -> None:
             for task in tasks:
                 task.result()
         assert over == []
-        assert min(taken.values()) > 5, taken
+        assert min(taken.values()) >= 10, taken
         assert stack.http.get("/v1/usage").json()["bytes"]["used"] == SIZE, "all that was taken is given back"
         # And at rest exactly as many as fit are taken.
         with ThreadPoolExecutor(12) as pool:
