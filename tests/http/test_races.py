@@ -74,6 +74,17 @@ def test_a_cancellation_that_was_accepted_is_one_whatever_dies(stack: Stack, vic
         )
 
 
+def test_a_job_cancelled_in_the_queue_holds_on_to_no_scan(stack: Stack) -> None:
+    """Its links to the scan's files would keep the disk that deleting the scan should give back."""
+    scan_id = commit(stack.http, FILES)
+    job_id = submit(stack.http, scan_id)
+    files = list((stack.data / "scans" / scan_id).iterdir())
+    assert {file.stat().st_nlink for file in files} == {2}
+    assert stack.http.post(f"/v1/jobs/{job_id}/cancel").json()["state"] == "cancelled"
+    assert {file.stat().st_nlink for file in files} == {1}
+    assert not (stack.data / "jobs" / job_id / "scan").exists()
+
+
 # Deleting while something is going on
 
 

@@ -180,18 +180,27 @@ def test_an_engine_that_something_else_kills_is_not_given_up_so_soon(run: Run, n
 def test_an_engine_that_gets_further_each_time_is_not_given_up(
     settings: WorkerSettings, ledger: Ledger, new_job: NewJob
 ) -> None:
-    """A machine that kills it every few steps costs attempts, not the job."""
+    """A machine that kills it whenever it has kept a state costs attempts, not the job."""
     job = new_job(steps=60, pause=0.05)
+    folder = JobFolder(settings.data, job.id)
+
+    def kill_once_further() -> None:
+        while (row := ledger.get(job.id)) is not None and row.state is State.RUNNING and row.attempt <= MAX_CRASHES + 1:
+            if folder.advanced():
+                kill_engine(job.id)
+                return
+            time.sleep(0.02)
+
     for _ in range(20):
         before = ledger.get(job.id)
         assert before is not None
         if before.state is State.SUCCEEDED:
             break
-        killer = when_running(ledger, job, lambda: later(0.7, lambda: kill_engine(job.id)))
+        killer = when_running(ledger, job, kill_once_further)
         supervise(settings, ledger, job.id, before.attempt)
         killer.join()
     done = ledger.get(job.id)
-    assert done is not None and done.state is State.SUCCEEDED and done.attempt > 2 and done.crashes == 1
+    assert done is not None and done.state is State.SUCCEEDED and done.attempt > MAX_CRASHES and done.crashes == 1
 
 
 def kill_engine(job_id: str) -> None:
@@ -202,7 +211,7 @@ def kill_engine(job_id: str) -> None:
 
 
 def test_the_next_attempt_goes_on_from_the_last_checkpoint(run: Run, new_job: NewJob, tmp_path: Path) -> None:
-    job = run(new_job(steps=20, pause=0.05, dies_at=12))
+    job = run(new_job(steps=20, pause=0.2, dies_at=12))
     assert (job.state, job.attempt, job.crashes) == (State.QUEUED, 2, 1) and "SIGSEGV" in job.message
     with zipfile.ZipFile(JobFolder(tmp_path, job.id).checkpoint) as kept:
         step_kept = json.loads(kept.read("state.json"))["dict"]["step"]
