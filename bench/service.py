@@ -24,15 +24,16 @@ from splatct_client.sending import send
 
 from server.redisserver import OwnRedis
 from splatcore.simulate import Simulation, simulate
+from worker.lifeline import before_exec
 
 _AGAIN_S = 1.0  # after a death
 
 
 class Part:
-    """One process of the service, started again when it died."""
+    """One process of the service, started again when it died. It dies with this process."""
 
-    def __init__(self, module: str, environment: dict[str, str], log: Path) -> None:
-        self._module, self._environment, self._log = module, environment, log
+    def __init__(self, command: Sequence[str], environment: dict[str, str], log: Path) -> None:
+        self._command, self._environment, self._log = command, environment, log
         self._process: subprocess.Popen[bytes] | None = None
         self._died_at = 0.0
 
@@ -48,9 +49,10 @@ class Part:
         if self._process is not None and self._process.poll() is not None:
             self._process, self._died_at = None, time.monotonic()
         if self._process is None and time.monotonic() - self._died_at >= _AGAIN_S:
-            command = [sys.executable, "-P", "-m", self._module, "--tie-to", str(os.getpid())]
             with self._log.open("ab") as log:
-                self._process = subprocess.Popen(command, env=self._environment, stdout=log, stderr=log)
+                self._process = subprocess.Popen(
+                    self._command, env=self._environment, stdout=log, stderr=log, preexec_fn=before_exec(signal.SIGKILL)
+                )
 
     def signal(self, which: signal.Signals) -> None:
         if self._process is not None:
@@ -90,8 +92,9 @@ class Service:
             "SPLATCT_PORT": str(self.port),
             **{f"SPLATCT_{name.upper()}": str(value) for name, value in (settings or {}).items()},
         }
-        self.server = Part(server, environment, self.log)
-        self.workers = [Part("worker", environment, self.log) for _ in range(workers)]
+        python = [sys.executable, "-P", "-m"]
+        self.server = Part([*python, server], environment, self.log)
+        self.workers = [Part([*python, "worker"], environment, self.log) for _ in range(workers)]
         self.url = f"http://127.0.0.1:{self.port}"
         self.client = Client(self.url)
 
@@ -153,7 +156,7 @@ class Service:
         """What a worker is at: its engine is its grandchild."""
         for job_id, pid in self.engines().items():
             with contextlib.suppress(OSError):
-                if worker.pid in (parent := _parent(pid), _parent(parent)):
+                if worker.pid in (parent := parent_of(pid), parent_of(parent)):
                     return job_id
         return None
 
@@ -178,5 +181,5 @@ def in_passing(
         yield service
 
 
-def _parent(pid: int) -> int:
+def parent_of(pid: int) -> int:
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])

@@ -81,6 +81,8 @@ def cancel_job(job_id: UUID, service: Served, response: Response) -> JobOut:
     job = service.store.jobs.ask_cancel(str(job_id))
     if job is None:
         raise not_found("job")
+    if job.state is State.CANCELLED:  # it was queued, so that nobody else will clear away what it has no more use for
+        service.folder(job.id).tidy()
     return _answer(service, job, response)
 
 

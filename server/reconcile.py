@@ -76,7 +76,7 @@ class Reconciler:
         elif folder.published():
             self._ledger.succeed(job.id, job.attempt)
         else:
-            end = self._ledger.crashed(job, "The worker died", folder.advanced())
+            end = self._ledger.crashed(job, "The worker died", folder.advanced(), by_others=True)
             if end is State.FAILED:
                 folder.tidy()
 

@@ -15,6 +15,9 @@ LOCAL_TENANT = "local"  # whose everything is as long as there are no keys
 # Attempts that may die without getting further before the job is given up; hand-backs do not count. More than a
 # few, since going on from a checkpoint costs little, and the next death may be the machine's fault again.
 MAX_CRASHES = 5
+# The same where the last was killed by another hand: a SIGKILL that was neither ours nor the kernel's for want of
+# memory, or the death of the worker, says little of the job. Still not for ever: a job may take its machine along.
+MAX_KILLS = 20
 HEARTBEAT_S = 2.0  # how often a supervisor marks its row
 DEAD_S = 8.0  # a heartbeat older than this, on another host, is a dead worker
 STUCK_S = 60.0  # on this host, where the lock still proves life, wait this long instead

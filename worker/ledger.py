@@ -14,7 +14,17 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from worker.contract import ACTIVE, FINISHED, LOCAL_TENANT, MAX_CRASHES, TRANSITIONS, ErrorKind, Priority, State
+from worker.contract import (
+    ACTIVE,
+    FINISHED,
+    LOCAL_TENANT,
+    MAX_CRASHES,
+    MAX_KILLS,
+    TRANSITIONS,
+    ErrorKind,
+    Priority,
+    State,
+)
 from worker.database import Database, metadata
 from worker.outbox import announce
 
@@ -235,15 +245,15 @@ class Ledger:
         """Queue the job again because its worker was told to stop: nobody's fault, not counted."""
         return self._requeue(job_id, attempt, "Its worker was stopped; waiting for another")
 
-    def crashed(self, job: Job, what: str, advanced: bool = False) -> State | None:
+    def crashed(self, job: Job, what: str, advanced: bool = False, by_others: bool = False) -> State | None:
         """Queue the job again after its attempt died, or fail it if that happened too often. Returns what became of it,
         None if it is no longer that attempt's.
 
         advanced: the attempt kept a state that the next one goes on from; so it was not this job that is to blame, or
-        at least it does not die at one place for ever.
+        at least it does not die at one place for ever. by_others: it did not die by itself.
         """
         crashes = 1 if advanced else job.crashes + 1
-        if crashes < MAX_CRASHES:
+        if crashes < (MAX_KILLS if by_others else MAX_CRASHES):
             again = self._requeue(job.id, job.attempt, f"{what}; waiting to go on", crashes=crashes)
             return State.QUEUED if again else None
         message = f"{what}, {crashes} times without getting further. Its log may say why; restart it then."

@@ -13,8 +13,9 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -31,6 +32,8 @@ from worker.redaction import Redaction
 from worker.settings import WorkerSettings
 
 log = logging.getLogger("splatct.worker")
+
+T = TypeVar("T")
 
 IN_LINE = 20  # jobs to try for; more workers than that never ask at one moment
 LOCK_WAIT_S = 3.0  # an engine that was just killed needs a moment to let go
@@ -260,17 +263,19 @@ class _Attempt:
             partial = self._folder.publish_partial(job.attempt)
             kept = " What there was is kept as a partial result." if partial else ""
             message = f"The job was stopped at its time limit of {limit}.{kept}"
-            ledger.fail(job.id, job.attempt, ErrorKind.TIMEOUT, message, partial=partial)
+            self._insist(lambda: ledger.fail(job.id, job.attempt, ErrorKind.TIMEOUT, message, partial=partial))
         elif self._stop.set or code in (Exit.STOPPED, Exit.CANCELLED):  # without us: somebody terminated it politely
-            ledger.hand_back(job.id, job.attempt)
+            self._insist(lambda: ledger.hand_back(job.id, job.attempt))
             return
         elif code in _ERRORS:
             message = self._error or _WORDLESS.get(code, "The engine failed. The log holds the details.")
-            ledger.fail(job.id, job.attempt, _ERRORS[Exit(code)], message)
+            self._insist(lambda: ledger.fail(job.id, job.attempt, _ERRORS[Exit(code)], message))
         elif code == -signal.SIGKILL and not self._killed_by_us and self._memory.killed():
-            ledger.fail(job.id, job.attempt, ErrorKind.OUT_OF_MEMORY, _OUT_OF_MEMORY)
+            self._insist(lambda: ledger.fail(job.id, job.attempt, ErrorKind.OUT_OF_MEMORY, _OUT_OF_MEMORY))
         else:
-            end = ledger.crashed(job, _obituary(code), advanced=self._folder.advanced())
+            by_others = code == -signal.SIGKILL and not self._killed_by_us
+            advanced = self._folder.advanced()
+            end = self._insist(lambda: ledger.crashed(job, _obituary(code), advanced, by_others))
             if end is not State.FAILED:
                 return
         self._folder.tidy()
@@ -285,7 +290,7 @@ class _Attempt:
         self._record_success()
 
     def _record_success(self) -> None:
-        if not self._ledger.succeed(self._job.id, self._job.attempt):
+        if not self._insist(lambda: self._ledger.succeed(self._job.id, self._job.attempt)):
             if self._insist_on_state() is not State.CANCELLING:
                 raise Lost
             self._record_cancel()  # the request came after the rename
@@ -294,23 +299,29 @@ class _Attempt:
 
     def _record_cancel(self) -> None:
         partial = self._folder.publish_partial(self._job.attempt)
-        self._ledger.end_cancel(self._job.id, self._job.attempt, partial)
+        self._insist(lambda: self._ledger.end_cancel(self._job.id, self._job.attempt, partial))
         self._folder.tidy()
 
     def _insist_on_state(self) -> State:
-        """The row's state, waiting out a database that is away. Raises Lost if it is not ours."""
-        deadline = time.monotonic() + DATABASE_PATIENCE_S
+        """The row's state. Raises Lost if it is not ours."""
+        state = self._insist(lambda: self._ledger.beat(self._job.id, self._job.attempt, self._news))
+        if state is None:
+            raise Lost
+        return state
+
+    def _insist(self, act: Callable[[], T]) -> T:
+        """Do it to the row, waiting out a database that is away or has no room; while it waits the job is shown as
+        running. Raises what the database said if that takes too long: then, or if we are killed, the reconcile loop
+        settles the job once the database takes it."""
+        began = time.monotonic()
         while True:
             try:
-                state = self._ledger.beat(self._job.id, self._job.attempt, self._news)
+                return act()
             except SQLAlchemyError:
-                if time.monotonic() > deadline:
+                patience_s = self._settings.drain_grace_s if self._stop.set else DATABASE_PATIENCE_S
+                if time.monotonic() - began > patience_s:
                     raise
                 time.sleep(1.0)
-                continue
-            if state is None:
-                raise Lost
-            return state
 
 
 def _obituary(code: int) -> str:

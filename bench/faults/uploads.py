@@ -96,7 +96,7 @@ class DisturbedUpload:
         self._service, self._rng = service, rng
         self._http = httpx.Client(base_url=service.url, trust_env=False, timeout=30)
         side = rng.choice((32, 64, 128, 256))
-        self._scan, self.data = _scan(side, rng.randrange(2**32))
+        self._scan, self.data = noise_scan(side, rng.randrange(2**32))
         self.chunk = rng.randrange(len(self.data) // 8, len(self.data))
         self._with_digests = rng.random() < 0.5
         self.id = ""
@@ -220,7 +220,7 @@ class DisturbedUpload:
         return int(self._http.head(self._path).raise_for_status().headers["Upload-Offset"])
 
 
-def _scan(side: int, seed: int) -> tuple[bytes, bytes]:
+def noise_scan(side: int, seed: int) -> tuple[bytes, bytes]:
     """scan.json and a stack of noise, in which no two chunks are alike."""
     pixels = np.random.default_rng(seed).random((_VIEWS, side, side), np.float32)
     out = io.BytesIO()

@@ -7,6 +7,7 @@ servers that start together one takes the steps; the others wait for it and find
 from __future__ import annotations
 
 import contextlib
+import glob
 import logging
 import os
 import sqlite3
@@ -39,7 +40,7 @@ class SchemaError(SplatCTError):
 def prepare(database: Database) -> None:
     """Make the tables, or bring older ones up to date. Raises SchemaError if they are newer than this program.
 
-    A SQLite file is copied beside itself first.
+    A SQLite file is copied beside itself first. A process that is killed meanwhile leaves the old version.
     """
     with database.writing() as write:
         if write.dialect.name == "postgresql":
@@ -83,8 +84,9 @@ def _backed_up(database: Database, version: int) -> Path | None:
         return None
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
     copy = Path(f"{name}.v{version}-{stamp}.bak")
+    for left in copy.parent.glob(f"{glob.escape(Path(name).name)}.v*.part*"):  # by an upgrade that was killed
+        left.unlink()
     part = copy.with_suffix(".part")
-    part.unlink(missing_ok=True)
     os.close(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     with contextlib.closing(sqlite3.connect(name)) as source, contextlib.closing(sqlite3.connect(part)) as target:
         source.backup(target)

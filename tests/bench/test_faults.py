@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from bench.faults import __main__ as faults
+from bench.faults.plainrq import SETUPS, WORK_S
 
 
 @pytest.mark.slow
@@ -28,3 +29,32 @@ def test_what_is_cut_is_committed_whole_and_hardly_sent_again(tmp_path: Path) ->
     assert set(found["faults"]) == {"client", "server", "overlap", "repeat", "reorder"}
     assert 0 < found["most_chunks_sent_again"] < 1
     assert "**corrupt commits** | 0" in (tmp_path / "faults.md").read_text()
+
+
+@pytest.mark.slow
+def test_plain_rq_meets_the_same_faults_and_loses_jobs(tmp_path: Path) -> None:
+    """If it lost none, the faults would be none, or the comparison would look away."""
+    assert faults.main(["--quick", "--only", "rq", "--seed", "3", "--out", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "faults.json").read_text())["rq"]
+    assert list(found) == [setup.name for setup in SETUPS]
+    for setup in found.values():
+        assert sum(setup["faults"].values()) == 14, "all but those of the server, which RQ has none of"
+        assert setup["struck"] == {"worker": 5, "engine": 5}
+        assert setup["lost"] or setup["stuck"], "FLUSHALL takes what waits in a queue"
+        assert max(setup["work_s"]) >= WORK_S
+    defaults, retried = found["RQ, its defaults"], found["RQ, Retry(max=5), Redis with appendonly"]
+    assert not defaults["engine_recovery_s"] and retried["engine_recovery_s"], "a killed work-horse's job is retried"
+    assert "retries none" in defaults["settings"] and defaults["settings"].endswith("appendonly no")
+    assert retried["settings"].endswith("appendonly yes")
+    assert "| **lost** |" in (tmp_path / "faults.md").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_a_full_disk_makes_others_wait_and_no_more(tmp_path: Path) -> None:
+    assert faults.main(["--quick", "--only", "disk", "--seed", "3", "--out", str(tmp_path)]) == 0
+    page = (tmp_path / "faults.md").read_text()
+    if "not run" in page:
+        pytest.skip(page)
+    found = json.loads((tmp_path / "faults.json").read_text())["disk"]
+    assert found["wrong"] == [] and found["done"] == {"upload": 2, "checkpoint": 2, "publish": 2, "delete": 6}

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
+import socket
 import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 import sqlalchemy as sa
 
@@ -21,6 +25,9 @@ from server.migrations.steps import STEPS
 from worker.database import Database, metadata
 
 from ..postgres import emptied, running_postgres
+
+NEWEST = len(STEPS)
+MANY = 5000  # jobs, some 10 MB
 
 
 @pytest.fixture(scope="module")
@@ -203,3 +210,166 @@ def test_a_server_refuses_a_newer_database_in_a_sentence(tmp_path: Path) -> None
         command = [sys.executable, "-m", "splatct_client", verb, "--data", str(tmp_path), "--port", "0"]
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 2 and "has version 1000" in done.stderr and "Traceback" not in done.stderr
+
+
+# Killed in the middle, and started side by side
+
+
+_DIES = """
+import os, sys, time
+from server.migrations import prepare, runner
+from server.migrations.steps import STEPS
+from worker.database import Database
+import sqlalchemy as sa
+
+def half(write):
+    write.execute(sa.text("CREATE TABLE half (id INTEGER)"))
+    write.execute(sa.text("DELETE FROM scans"))
+    print("half", flush=True)
+    time.sleep(60)
+
+runner.STEPS = (*STEPS, half)
+prepare(Database(sys.argv[1]))
+"""
+
+
+def test_an_upgrade_that_is_killed_half_way_leaves_the_old_version_and_is_done_again(
+    empty: Callable[[], Database],
+) -> None:
+    database = first(empty())
+    before, tables = everything(database), shape(database)
+    url = database.engine.url.render_as_string(hide_password=False)
+    with subprocess.Popen([sys.executable, "-c", _DIES, url], stdout=subprocess.PIPE, text=True) as upgrade:
+        assert upgrade.stdout is not None and upgrade.stdout.readline() == "half\n"
+        upgrade.kill()
+    assert (everything(database), shape(database)) == (before, tables)
+    prepare(database)
+    after = everything(database)
+    assert "half" not in after and [row["version"] for row in after["schema_versions"]] == list(range(1, NEWEST + 1))
+    assert [row["id"] for row in after["scans"]] == ["s"]
+
+
+@pytest.mark.slow
+def test_a_server_killed_at_any_moment_of_an_upgrade_upgrades_when_it_is_started_again(tmp_path: Path) -> None:
+    """By the real server on a file of some size, so that copying and changing it take their time."""
+    original = tmp_path / "original.db"
+    grown(f"sqlite:///{original}")
+    reached = set()
+    for turn in range(6):
+        folder = tmp_path / str(turn)
+        folder.mkdir()
+        shutil.copyfile(original, folder / "splatct.db")
+        with subprocess.Popen(_server(folder), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as server:
+            stages = {"copying": "*.part", "changing": "*.bak"}  # killed a moment after such a file is there
+            stage = list(stages)[turn % 2]
+            deadline = time.monotonic() + 60
+            while not list(folder.glob(stages[stage])) and time.monotonic() < deadline:
+                time.sleep(0.001)
+            time.sleep(turn // 2 * 0.01)
+            server.kill()
+        with contextlib.closing(sqlite3.connect(folder / "splatct.db")) as found:
+            names = {row[0] for row in found.execute("SELECT name FROM sqlite_master")}
+            reached.add((stage, "schema_versions" in names))
+        database = Database(f"sqlite:///{folder / 'splatct.db'}")
+        prepare(database)
+        after = everything(database)
+        database.close()
+        assert len(after["jobs"]) == MANY and [row["version"] for row in after["schema_versions"]][-1] == NEWEST
+        assert not list(folder.glob("*.part")), "what a killed copy left takes no room"
+        for copy in folder.glob("*.bak"):
+            with contextlib.closing(sqlite3.connect(copy)) as kept:
+                assert kept.execute("SELECT count(*) FROM jobs").fetchone() == (MANY,), "every copy is whole"
+    assert ("copying", False) in reached, reached
+
+
+def test_servers_that_start_together_on_an_old_schema_all_serve(tmp_path: Path) -> None:
+    grown(f"sqlite:///{tmp_path / 'splatct.db'}")
+    ports = [_free_port() for _ in range(3)]
+    servers = [
+        subprocess.Popen(_server(tmp_path, port), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        for port in ports
+    ]
+    try:
+        for port in ports:
+            deadline = time.monotonic() + 60
+            while not _healthy(port):
+                assert time.monotonic() < deadline and all(server.poll() is None for server in servers)
+                time.sleep(0.1)
+    finally:
+        for server in servers:
+            server.kill()
+            server.wait()
+    database = Database(f"sqlite:///{tmp_path / 'splatct.db'}")
+    after = everything(database)
+    database.close()
+    assert [row["version"] for row in after["schema_versions"]] == list(range(1, NEWEST + 1))
+    assert len(after["jobs"]) == MANY and len(list(tmp_path.glob("*.bak"))) == 1
+
+
+def grown(url: str) -> None:
+    """Version 1 with many jobs."""
+    database = first(Database(url))
+    row = everything(database)["jobs"][0]
+    table = sa.Table("jobs", sa.MetaData(), autoload_with=database.engine)
+    with database.writing() as write:
+        write.execute(table.insert(), [row | {"id": f"j{n}", "message": "x" * 2000} for n in range(MANY - 1)])
+    database.close()
+
+
+def _server(data: Path, port: int = 0) -> list[str]:
+    return [sys.executable, "-m", "splatct_client", "server", "--data", str(data), "--port", str(port or _free_port())]
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _healthy(port: int) -> bool:
+    with contextlib.suppress(httpx.TransportError):
+        return httpx.get(f"http://127.0.0.1:{port}/healthz", trust_env=False).status_code == 200
+    return False
+
+
+# Every version with rows in every table
+
+
+@pytest.mark.parametrize("version", range(1, NEWEST), ids=str)
+def test_rows_of_every_table_of_every_version_are_kept(empty: Callable[[], Database], version: int) -> None:
+    database = empty()
+    with database.writing() as write:
+        for step in STEPS[:version]:
+            step(write)
+        if version > 1:
+            runner._versions.create(write)
+            rows = [{"version": number, "applied_at": float(number)} for number in range(1, version + 1)]
+            write.execute(runner._versions.insert(), rows)
+        there = sa.MetaData()
+        there.reflect(bind=write)
+        for table in there.sorted_tables:  # what is referred to comes first
+            if table.name != runner._versions.name:
+                write.execute(table.insert().values({column.name: _some(column) for column in table.columns}))
+    before = everything(database)
+    assert all(before.values()), "no table is empty"
+    prepare(database)
+    after = everything(database)
+    for name, rows in before.items():
+        kept = after[name][: len(rows)] if name == runner._versions.name else after[name]
+        assert [{column: row[column] for column in rows[0]} for row in kept] == rows, name
+    fresh = empty()
+    prepare(fresh)
+    upgraded = shape(fresh)
+    assert set(after) == set(upgraded)
+
+
+def _some(column: sa.Column[Any]) -> Any:
+    """A value of its type; all texts alike, so that what refers finds what it refers to."""
+    if column.name == "state":
+        return "queued"
+    kind = column.type
+    if isinstance(kind, sa.JSON):
+        return {}
+    if isinstance(kind, sa.Boolean):
+        return True
+    return {int: 7, float: 5.0}.get(kind.python_type, "x")

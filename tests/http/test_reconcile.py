@@ -11,7 +11,7 @@ import pytest
 from server.migrations import prepare
 from server.reconcile import Reconciler
 from server.store import Store
-from worker.contract import DEAD_S, MAX_CRASHES, STUCK_S, ErrorKind, State
+from worker.contract import DEAD_S, MAX_KILLS, STUCK_S, ErrorKind, State
 from worker.database import Database
 from worker.jobfolder import JobFolder
 from worker.ledger import Job
@@ -114,12 +114,12 @@ def test_a_cancelled_jobs_results_are_dropped(world: World) -> None:
 
 def test_it_is_given_up_at_last(world: World) -> None:
     job = world.running(host_id())
-    for attempt in range(1, MAX_CRASHES + 1):
+    for attempt in range(1, MAX_KILLS + 1):
         world.reconciler.sweep()
         world.store.jobs.claim(job.id, attempt + 1, host_id())
     end = world.store.jobs.get(job.id)
     assert end is not None and (end.state, end.error_kind) == (State.FAILED, ErrorKind.CRASHED)
-    assert f"The worker died, {MAX_CRASHES} times" in (end.error_message or "")
+    assert f"The worker died, {MAX_KILLS} times" in (end.error_message or "")
 
 
 def test_a_job_without_a_folder_fails_with_a_reason(world: World) -> None:

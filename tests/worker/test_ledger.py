@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from worker.contract import MAX_CRASHES, ErrorKind, State
+from worker.contract import MAX_CRASHES, MAX_KILLS, ErrorKind, State
 from worker.database import Database
 from worker.ledger import Job, Ledger
 
@@ -51,14 +51,16 @@ def test_a_stale_attempt_is_fenced_off(ledger: Ledger, new_job: NewJob) -> None:
     assert ledger.succeed(job.id, 2)
 
 
-def test_crashes_are_counted_and_end(ledger: Ledger, new_job: NewJob) -> None:
+@pytest.mark.parametrize(("by_others", "most"), [(False, MAX_CRASHES), (True, MAX_KILLS)], ids=["itself", "others"])
+def test_crashes_are_counted_and_end(ledger: Ledger, new_job: NewJob, by_others: bool, most: int) -> None:
     job = new_job()
-    for attempt in range(1, MAX_CRASHES + 1):
+    for attempt in range(1, most + 1):
+        assert current(ledger, job).state is State.QUEUED
         claimed = ledger.claim(job.id, attempt, "here")
-        assert claimed is not None and ledger.crashed(claimed, "The engine was killed (SIGKILL)")
+        assert claimed is not None and ledger.crashed(claimed, "The engine was killed (SIGKILL)", by_others=by_others)
     end = current(ledger, job)
-    assert (end.state, end.error_kind, end.attempt) == (State.FAILED, ErrorKind.CRASHED, MAX_CRASHES)
-    assert end.error_message is not None and f"killed (SIGKILL), {MAX_CRASHES} times" in end.error_message
+    assert (end.state, end.error_kind, end.attempt) == (State.FAILED, ErrorKind.CRASHED, most)
+    assert end.error_message is not None and f"killed (SIGKILL), {most} times" in end.error_message
     assert end.finished_at is not None
 
 

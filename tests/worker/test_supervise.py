@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import signal
+import sqlite3
 import threading
 import time
 import zipfile
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy.exc import OperationalError
 
 from worker.contract import MAX_CRASHES, ErrorKind, State
 from worker.jobfolder import JobFolder
@@ -123,6 +125,33 @@ def test_another_error_around_the_engine_is_no_full_disk(
     assert found is not None and found.state is State.RUNNING, "the reconcile loop will judge"
 
 
+@pytest.mark.parametrize(
+    ("plan", "method", "state"),
+    [
+        ({}, "succeed", State.SUCCEEDED),
+        ({"end": "full"}, "fail", State.FAILED),
+        ({"end": "killed"}, "crashed", State.QUEUED),
+    ],
+    ids=["success", "failure", "death"],
+)
+def test_an_end_that_the_database_has_no_room_for_is_recorded_when_it_has(
+    run: Run, new_job: NewJob, monkeypatch: pytest.MonkeyPatch, plan: dict[str, Any], method: str, state: State
+) -> None:
+    monkeypatch.setattr("worker.supervise.time.sleep", lambda _: None)
+    record, refused = getattr(Ledger, method), []
+
+    def full(*given: Any, **named: Any) -> Any:
+        if len(refused) < 3:
+            refused.append(method)
+            raise OperationalError("UPDATE jobs", {}, sqlite3.OperationalError("database or disk is full"))
+        return record(*given, **named)
+
+    monkeypatch.setattr(Ledger, method, full)
+    job = run(new_job(**plan))
+    assert (job.state, len(refused)) == (state, 3)
+    assert (job.error_kind == ErrorKind.DISK_FULL) == (state is State.FAILED)
+
+
 def test_events_that_do_not_fit_cost_the_run_nothing(
     run: Run, new_job: NewJob, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,32 +159,48 @@ def test_events_that_do_not_fit_cost_the_run_nothing(
     assert run(new_job(steps=4)).state is State.SUCCEEDED
 
 
-def test_a_killed_engine_is_tried_again_but_not_for_ever(run: Run, new_job: NewJob, tmp_path: Path) -> None:
-    job = new_job(end="killed", steps=0)
+def test_an_engine_that_dies_is_tried_again_but_not_for_ever(run: Run, new_job: NewJob, tmp_path: Path) -> None:
+    job = new_job(end="segfault", steps=0)
     for attempt in range(2, MAX_CRASHES + 1):
         job = run(job)
         assert (job.state, job.attempt) == (State.QUEUED, attempt)
     job = run(job)
     assert (job.state, job.error_kind) == (State.FAILED, ErrorKind.CRASHED)
     message = job.error_message or ""
-    assert "SIGKILL" in message and "environment: " not in message  # the log has that, and is not for everybody
+    assert "SIGSEGV" in message and "environment: " not in message  # the log has that, and is not for everybody
+
+
+def test_an_engine_that_something_else_kills_is_not_given_up_so_soon(run: Run, new_job: NewJob) -> None:
+    job = new_job(end="killed", steps=0)
+    for attempt in range(2, MAX_CRASHES + 3):
+        job = run(job)
+        assert (job.state, job.attempt, job.crashes) == (State.QUEUED, attempt, attempt - 1)
 
 
 def test_an_engine_that_gets_further_each_time_is_not_given_up(
     settings: WorkerSettings, ledger: Ledger, new_job: NewJob
 ) -> None:
-    """A machine that kills it every few steps costs attempts, not the job."""
+    """A machine that kills it whenever it has kept a state costs attempts, not the job."""
     job = new_job(steps=60, pause=0.05)
+    folder = JobFolder(settings.data, job.id)
+
+    def kill_once_further() -> None:
+        while (row := ledger.get(job.id)) is not None and row.state is State.RUNNING and row.attempt <= MAX_CRASHES + 1:
+            if folder.advanced():
+                kill_engine(job.id)
+                return
+            time.sleep(0.02)
+
     for _ in range(20):
         before = ledger.get(job.id)
         assert before is not None
         if before.state is State.SUCCEEDED:
             break
-        killer = when_running(ledger, job, lambda: later(0.7, lambda: kill_engine(job.id)))
+        killer = when_running(ledger, job, kill_once_further)
         supervise(settings, ledger, job.id, before.attempt)
         killer.join()
     done = ledger.get(job.id)
-    assert done is not None and done.state is State.SUCCEEDED and done.attempt > 2 and done.crashes == 1
+    assert done is not None and done.state is State.SUCCEEDED and done.attempt > MAX_CRASHES and done.crashes == 1
 
 
 def kill_engine(job_id: str) -> None:
@@ -166,7 +211,7 @@ def kill_engine(job_id: str) -> None:
 
 
 def test_the_next_attempt_goes_on_from_the_last_checkpoint(run: Run, new_job: NewJob, tmp_path: Path) -> None:
-    job = run(new_job(steps=20, pause=0.05, dies_at=12))
+    job = run(new_job(steps=20, pause=0.2, dies_at=12))
     assert (job.state, job.attempt, job.crashes) == (State.QUEUED, 2, 1) and "SIGSEGV" in job.message
     with zipfile.ZipFile(JobFolder(tmp_path, job.id).checkpoint) as kept:
         step_kept = json.loads(kept.read("state.json"))["dict"]["step"]

@@ -33,7 +33,7 @@ def reconstruct(plan: dict[str, Any], options: Options, keeper: Keeper) -> Gener
             time.sleep(plan.get("pause", 0.0))
             fraction = (step + 1) / (steps + 1)
             yield Progress("level", fraction, f"Step {step + 1} of {steps}", step=step, loss=1 / (step + 1))
-            if plan.get("dies_at") == step and not first:
+            if plan.get("dies_at") == step and state is None:
                 os.kill(os.getpid(), signal.SIGSEGV)
     except Concluding:
         return {"options": options.to_dict(), "seed": options.seed, "partial": True}
@@ -46,6 +46,8 @@ def reconstruct(plan: dict[str, Any], options: Options, keeper: Keeper) -> Gener
         raise ZeroDivisionError("secret detail")
     if end == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
+    if end == "segfault":
+        os.kill(os.getpid(), signal.SIGSEGV)
     if end == "full":
         raise OSError(28, "No space left on device")
     return {"options": options.to_dict(), "seed": options.seed, "bytes": plan.get("result_bytes", 0)}

@@ -1,4 +1,4 @@
-"""A real file system of a few MiB, so that a test can fill it to the last byte."""
+"""A real file system of a few MiB, to be filled to the last byte."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 MIB = 1 << 20
+
+
+class NoMount(Exception):
+    """A file system cannot be mounted here: why."""
 
 
 class TinyDisk:
@@ -30,17 +32,17 @@ class TinyDisk:
                 file.write(bytes(min(rest, MIB)))
 
     def empty(self) -> None:
-        self._filler.unlink()
+        self._filler.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def tiny_disk(path: Path, mib: int) -> Iterator[TinyDisk]:
-    """A tmpfs at `path`. Mounting asks for root, or what a container calls CAP_SYS_ADMIN."""
+    """A tmpfs at `path`. Mounting asks for root, or what a container calls CAP_SYS_ADMIN; raises NoMount without."""
     path.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={mib}m,mode=700", "tmpfs", str(path)]
     done = subprocess.run(mount, capture_output=True, text=True, check=False)
     if done.returncode:
-        pytest.skip(f"a file system of {mib} MiB cannot be mounted as uid {os.getuid()}: {done.stderr.strip()}")
+        raise NoMount(f"a file system of {mib} MiB cannot be mounted as uid {os.getuid()}: {done.stderr.strip()}")
     try:
         yield TinyDisk(path)
     finally:
