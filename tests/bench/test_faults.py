@@ -43,7 +43,8 @@ def test_plain_rq_meets_the_same_faults_and_loses_jobs(tmp_path: Path) -> None:
         assert setup["lost"] or setup["stuck"], "FLUSHALL takes what waits in a queue"
         assert max(setup["work_s"]) >= WORK_S
     defaults, retried = found["RQ, its defaults"], found["RQ, Retry(max=5), Redis with appendonly"]
-    assert not defaults["engine_recovery_s"] and retried["engine_recovery_s"], "a killed work-horse's job is retried"
+    # How soon is left to chance here: a retried job waits behind all others, or is lost before its turn.
+    assert not defaults["engine_recovery_s"] and retried["attempts"] > retried["jobs"], "a killed work-horse is retried"
     assert "retries none" in defaults["settings"] and defaults["settings"].endswith("appendonly no")
     assert retried["settings"].endswith("appendonly yes")
     assert "| **lost** |" in (tmp_path / "faults.md").read_text()

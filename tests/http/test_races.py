@@ -19,7 +19,7 @@ from rq.serializers import JSONSerializer
 
 from worker.contract import QUEUE, TASK, queue_id
 
-from .stack import Stack, announce, commit, kill, scan_files, submit
+from .stack import Stack, commit, kill, scan_files, submit
 
 FILES = scan_files()
 SIZE = sum(map(len, FILES.values()))
@@ -160,14 +160,17 @@ def test_of_several_workers_one_runs_a_job_that_the_queue_names_many_times(stack
 
 @pytest.mark.slow
 def test_at_the_edge_of_a_quota_none_is_ever_over_it(tmp_path: Path) -> None:
-    """Uploads that begin whole, that grow and that go; jobs of every kind of submission, and cancelled ones."""
-    stack, most_jobs, most_scans = Stack(tmp_path), 3, 4
-    limit = round((most_scans + 0.5) * SIZE)
+    """Uploads that begin whole, that grow and that go; jobs of every kind of submission, and cancelled ones. The bytes
+    are enough for three jobs, or for an upload less with each."""
+    stack, most_jobs, job_bytes = Stack(tmp_path), 3, 4_506_048
+    limit = round(3.5 * job_bytes)
     stack.environment |= {"SPLATCT_TENANT_GIB": str(limit / (1 << 30)), "SPLATCT_TENANT_JOBS": str(most_jobs)}
     stack.environment |= {"SPLATCT_RATE_PER_S": "0"}
     with stack:
         scan_id = commit(stack.http, FILES)
-        listed = [{"name": name, "size": len(data)} for name, data in FILES.items()]
+        estimate = stack.http.post("/v1/jobs/validate", json={"scan_id": scan_id}).raise_for_status().json()
+        assert estimate["disk_bytes"] == job_bytes
+        listed = [{"name": "scan.json", "size": 1000}, {"name": "projections.tif", "size": round(0.8 * job_bytes)}]
         began, over, taken = time.monotonic(), [], {"upload": 0, "grown": 0, "job": 0}
 
         def going_on() -> bool:
@@ -200,7 +203,7 @@ def test_at_the_edge_of_a_quota_none_is_ever_over_it(tmp_path: Path) -> None:
                 while going_on():
                     body = {"scan_id": scan_id}
                     made = http.put(f"/v1/jobs/{uuid4()}", json=body) if put else http.post("/v1/jobs", json=body)
-                    assert made.status_code in (202, 429), made.text
+                    assert made.status_code in (202, 429, 507), made.text
                     if made.status_code == 202:
                         taken["job"] += 1
                         http.post(f"/v1/jobs/{made.json()['id']}/cancel").raise_for_status()
@@ -213,11 +216,12 @@ def test_at_the_edge_of_a_quota_none_is_ever_over_it(tmp_path: Path) -> None:
                 task.result()
         assert over == []
         assert min(taken.values()) >= 10, taken
-        assert stack.http.get("/v1/usage").json()["bytes"]["used"] == SIZE, "all that was taken is given back"
+        # The last of the cancelled jobs is measured by the next round of the reconciler.
+        stack.until(
+            lambda: stack.http.get("/v1/usage").json()["bytes"]["used"] == SIZE, 20, "all that was taken is given back"
+        )
         # And at rest exactly as many as fit are taken.
         with ThreadPoolExecutor(12) as pool:
             answers = list(pool.map(lambda _: stack.http.post("/v1/jobs", json={"scan_id": scan_id}), range(12)))
         assert sorted(a.status_code for a in answers) == [202] * most_jobs + [429] * (12 - most_jobs)
-        for _ in range(most_scans - 1):
-            announce(stack.http, FILES)
         assert stack.http.post("/v1/uploads", json={"name": "s", "files": listed}).status_code == 507
