@@ -83,7 +83,9 @@ def reconstruct(
     state, word = keeper.recall(lambda: identity(scan, options), _KINDS)
     verdict: Verdict | None = None if state is None else state["verdict"]
     if verdict is None:
-        yield Progress("start", 0.0, "Finding out how the scanner turns and how its images are stored")
+        trying = "find out how the scanner turns and how its images are stored"
+        yield Progress("start", 0.0, f"{word}; {trying}" if word else trying)
+        word = ""  # has been said
         scan, verdict = oriented(scan, options, options.threads)
     else:
         scan = read_as(scan, options, verdict.found)
