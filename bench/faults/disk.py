@@ -55,15 +55,16 @@ def fill_the_disk(folder: Path, rounds: int, seed: int, say: Callable[[str], Non
     out, began = DiskOutcome(), time.monotonic()
     with tiny_disk(folder / "disk", _DISK_MIB) as disk, Struck(disk.path, 1, _SETTINGS) as service:
         for number in range(rounds):
-            filled = _Filled(service, disk, random.Random(f"{seed}/{number}"), out)
-            for kind in ("upload", "checkpoint", "publish"):
-                try:
-                    getattr(filled, kind)()
-                    out.done[kind] += 1
-                except (httpx.HTTPError, TimeoutError, Wrong) as failure:
-                    out.wrong.append(f"round {number + 1}, {kind}: {type(failure).__name__}: {failure}"[:300])
-                finally:
-                    disk.empty()
+            with httpx.Client(base_url=service.url, trust_env=False, timeout=60) as http:
+                filled = _Filled(service, http, disk, random.Random(f"{seed}/{number}"), out)
+                for kind in ("upload", "checkpoint", "publish"):
+                    try:
+                        getattr(filled, kind)()
+                        out.done[kind] += 1
+                    except (httpx.HTTPError, TimeoutError, Wrong) as failure:
+                        out.wrong.append(f"round {number + 1}, {kind}: {type(failure).__name__}: {failure}"[:300])
+                    finally:
+                        disk.empty()
             say(f"{number + 1} of {rounds} times on a full disk")
     out.minutes = round((time.monotonic() - began) / 60, 1)
     return out
@@ -76,9 +77,10 @@ class Wrong(Exception):
 class _Filled:
     """One round."""
 
-    def __init__(self, service: Struck, disk: TinyDisk, rng: random.Random, out: DiskOutcome) -> None:
-        self._service, self._disk, self._rng, self._out = service, disk, rng, out
-        self._http = httpx.Client(base_url=service.url, trust_env=False, timeout=60)
+    def __init__(
+        self, service: Struck, http: httpx.Client, disk: TinyDisk, rng: random.Random, out: DiskOutcome
+    ) -> None:
+        self._service, self._http, self._disk, self._rng, self._out = service, http, disk, rng, out
 
     def upload(self) -> None:
         spare = self._send(*self._announce())

@@ -171,6 +171,6 @@ def test_a_result_without_room_fails_the_job_and_a_restart_goes_on(tight: Stack,
     disk.empty()
     again = tight.http.post(f"/v1/jobs/{job}/restart").json()["id"]
     assert tight.wait(again, "succeeded", "failed")["state"] == "succeeded"
-    first = tight.http.get(f"/v1/jobs/{again}/events").json()["events"][0]
-    assert first["message"] == "Going on from the checkpoint"
+    events = tight.http.get(f"/v1/jobs/{again}/events").json()["events"]
+    assert [event["message"] for event in events[:2]] == ["Reading the scan", "Going on from the checkpoint"]
     assert tight.http.delete(f"/v1/jobs/{job}").status_code == 204

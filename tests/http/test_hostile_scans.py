@@ -108,7 +108,9 @@ def test_no_scan_reads_another_tenants_pixels(measured: Stack, victim: tuple[str
     scan_id, owner = victim
     assert owner.get(f"/v1/scans/{scan_id}").json()["facts"]["line_integral"]["max"] == 0.625
     upload_id = send(measured.http, reaching(how, scan_id, str(measured.data)))
-    answer = measured.http.post(f"/v1/uploads/{upload_id}/commit")
+    mine = measured.http
+    with httpx.Client(base_url=mine.base_url, headers=mine.headers, trust_env=False, timeout=30) as plain:
+        answer = plain.post(f"/v1/uploads/{upload_id}/commit")  # whose own words, a path, may come back to it
     assert answer.status_code == (201 if how.startswith("metadata") else 422)
     assert "0.625" not in answer.text
     if answer.status_code == 201:
