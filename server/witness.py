@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 
 from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.exc import SQLAlchemyError
@@ -57,7 +58,7 @@ _MOST_READS = 10_000
 class Witness:
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
-        self._reads: dict[Deed, float] = {}
+        self._reads = Recent(_READ_AGAIN_S, _MOST_READS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -67,21 +68,33 @@ class Witness:
         async def noting(message: Message) -> None:
             if message["type"] == "http.response.start":
                 deed = _deed(scope, message["status"], Headers(raw=message["headers"]))
-                if deed is not None and not self._just_read(deed):
+                if deed is not None and not (deed.action.startswith("read-") and self._reads.again(deed)):
                     await run_in_threadpool(_note, scope["app"].state.audit, deed)
             await send(message)
 
         await self.app(scope, receive, noting)
 
-    def _just_read(self, deed: Deed) -> bool:
-        if not deed.action.startswith("read-"):
-            return False
-        now = time.monotonic()
-        if now - self._reads.get(deed, float("-inf")) < _READ_AGAIN_S:
+
+class Recent:
+    """Remembers deeds for so many seconds, `most` at a time, and nothing for longer."""
+
+    def __init__(self, seconds: float, most: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._seconds, self._most, self._clock = seconds, most, clock
+        self._noted: dict[Deed, float] = {}  # when, oldest first
+
+    def __len__(self) -> int:
+        return len(self._noted)
+
+    def again(self, deed: Deed) -> bool:
+        """Whether it is one of them; if not, it is from now on."""
+        now = self._clock()
+        while self._noted and now - self._noted[first := next(iter(self._noted))] >= self._seconds:
+            del self._noted[first]
+        if deed in self._noted:
             return True
-        if len(self._reads) >= _MOST_READS:
-            self._reads = {known: at for known, at in self._reads.items() if now - at < _READ_AGAIN_S}
-        self._reads[deed] = now
+        if len(self._noted) >= self._most:
+            del self._noted[next(iter(self._noted))]
+        self._noted[deed] = now
         return False
 
 

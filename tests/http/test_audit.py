@@ -20,7 +20,7 @@ from server.app import create_app
 from server.audit import AuditLog, Deed, Wanted, audit
 from server.migrations import prepare
 from server.settings import Settings
-from server.witness import ACTIONS
+from server.witness import ACTIONS, Recent
 from worker.database import Database
 
 from ..postgres import emptied, running_postgres
@@ -32,6 +32,23 @@ def entries(stack: Stack, **wanted: Any) -> list[dict[str, Any]]:
     found = list(AuditLog(database).entries(Wanted(**wanted)))
     database.close()
     return found
+
+
+def test_readings_are_remembered_for_a_while_and_no_longer() -> None:
+    """Or a server would grow with every job that is looked at."""
+    now = 0.0
+    recent = Recent(60.0, 100, lambda: now)
+    deeds = [Deed("lab", None, "", "read-results", str(number), "", None) for number in range(150)]
+    assert not recent.again(deeds[0]) and recent.again(deeds[0])
+    now = 59.0
+    assert recent.again(deeds[0]) and not recent.again(deeds[1])
+    now = 60.0
+    assert not recent.again(deeds[0]) and recent.again(deeds[1])  # counted from when it was noted
+    now = 130.0
+    assert not recent.again(deeds[2]) and len(recent) == 1
+    for deed in deeds:
+        recent.again(deed)
+    assert len(recent) == 100 and recent.again(deeds[-1]) and not recent.again(deeds[0])
 
 
 def test_every_call_that_changes_something_is_noted() -> None:
