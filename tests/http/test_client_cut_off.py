@@ -210,6 +210,7 @@ def test_views_are_sent_while_the_scanner_writes(scanner: Scanner) -> None:
     assert scanner.received() <= scanner.sent(*names, "scan.json") + view_bytes
 
 
+@pytest.mark.slow
 def test_a_view_that_is_still_written_waits(scanner: Scanner) -> None:
     """It stands still for less than it must, again and again; then the scan is whole."""
     scanner.describe(["slow.tif"], 12, 16)

@@ -12,6 +12,8 @@ from .stack import Stack, commit, kill, scan_files, submit
 
 HOUR_S = 3600.0
 
+pytestmark = pytest.mark.slow
+
 
 class Clock:
     def __init__(self, file: Path) -> None:

@@ -88,6 +88,7 @@ def test_a_job_cancelled_in_the_queue_holds_on_to_no_scan(stack: Stack) -> None:
 # Deleting while something is going on
 
 
+@pytest.mark.slow
 def test_a_job_at_work_is_not_deleted_and_one_that_just_ended_is_whole_or_gone(stack: Stack) -> None:
     stack.start_worker()
     scan_id = commit(stack.http, scan_files(steps=3, pause=0.05))
