@@ -32,9 +32,7 @@ class WorkerSettings(BaseSettings):
     checkpoint_s: float = 10.0  # at least so long between two writings of the engine's state; 0: it keeps none
     engine_memory_mib: int = Field(default=0, ge=0)  # 0: all that this machine, or the cgroup, gives
     engine_file_mib: int = Field(default=1 << 20, ge=1)  # of the largest file the engine may write
-    engine_nice: int = Field(
-        default=5, ge=0, le=19
-    )  # the engine gives way to the server, and to whoever else is in need
+    engine_nice: int = Field(default=5, ge=0, le=19)  # the engine gives way to the server, and to all others
     engine: str = "splatcore"  # for tests: the package the engine process takes its functions from
 
     # Test mode (docs/test-mode.md). Nothing below works without the first.

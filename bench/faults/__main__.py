@@ -26,6 +26,7 @@ from bench.faults.plainrq import SETUPS, PlainRQ, Setup
 from bench.faults.service import Struck
 from bench.faults.table import Column, side_by_side
 from bench.faults.uploads import run_uploads
+from bench.service import in_passing
 
 _FULL = Counts(kills=100, server=20, redis=20, wipes=10, drains=10)
 _QUICK = Counts(kills=10, server=2, redis=2, wipes=1, drains=1)
@@ -50,7 +51,7 @@ def main(argv: list[str] | None = None) -> int:
     page, good, columns = "", True, []
     args.out.mkdir(parents=True, exist_ok=True)
     if "uploads" in parts:
-        with _timed() as minutes, _folder() as folder, Struck(folder, workers=0) as service:
+        with _timed() as minutes, in_passing(workers=0) as service:
             count = args.uploads or (100 if args.quick else 1000)
             cut = run_uploads(service, count, args.seed, print)
         found["uploads"] = {**cut.to_json(), "minutes": minutes()}
