@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from bench.peak import peak_mib
 from splatcore.document import Document
 from splatcore.evaluate import evaluate
 from splatcore.machine import threads_allowed
@@ -71,8 +71,7 @@ def main() -> None:
                 ),
                 flush=True,
             )
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"\npeak memory {peak:.0f} MiB")
+    print(f"\npeak memory {peak_mib():.0f} MiB")
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 

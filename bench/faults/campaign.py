@@ -250,7 +250,8 @@ class Campaign:
         out.resumed += sum("Going on from the checkpoint" in event["message"] for event in events)
         seconds: dict[int, list[float]] = {}
         for event in events:
-            if "attempt" in event and "seconds" in event:
+            # What is told before a run begins, or goes on, has no part of its time.
+            if "attempt" in event and "seconds" in event and event.get("stage") != "read":
                 seconds.setdefault(event["attempt"], []).append(event["seconds"])
         if seconds:
             out.work_s.append(max(told[-1] for told in seconds.values()))

@@ -14,6 +14,7 @@ import numpy as np
 from bench.paper import voxels
 from bench.paper.cells import Cell
 from bench.paper.rtk.remote import RTK
+from bench.peak import peak_mib
 from splatcore import r2
 from splatcore.evaluate import evaluate, pose_scores, read_truth
 from splatcore.gauge import align
@@ -85,7 +86,7 @@ def _baseline(job: Job) -> dict[str, Any]:
 
 
 def _scored(job: Job, result: Reconstruction) -> dict[str, Any]:
-    peak = _peak_mib()  # before voxelising and scoring
+    peak = peak_mib()  # before voxelising and scoring
     folder = job.out / "result"
     write_results(result, folder, overwrite=True)
     scores = evaluate(folder, job.folder, job.threads)
@@ -111,7 +112,7 @@ def _voxels(reconstruct: Callable[[Job, Scan], tuple[Floats, Frames]]) -> Callab
         scan = job.scan()
         began = time.perf_counter()
         volume, frames = reconstruct(job, scan)
-        seconds, peak = time.perf_counter() - began, _peak_mib()
+        seconds, peak = time.perf_counter() - began, peak_mib()
         return {**voxels.score(volume, frames, scan.volume, job.folder), "seconds": seconds, "peak_mib": peak}
 
     return run
@@ -158,13 +159,7 @@ def _bound(job: Job) -> dict[str, Any]:
     header, _, _, true = read_truth(job.folder)
     assert header.volume is not None
     found = bound(job.folder, threads=job.threads)
-    return {**found, "nominal": pose_scores(true, header.frames, header.volume), "peak_mib": _peak_mib()}
-
-
-def _peak_mib() -> float:
-    """Of this program alone: `ru_maxrss` would start with the peak of the process that forked it."""
-    status = Path("/proc/self/status").read_text(encoding="utf-8")
-    return int(status.split("VmHWM:")[1].split()[0]) / 1024
+    return {**found, "nominal": pose_scores(true, header.frames, header.volume), "peak_mib": peak_mib()}
 
 
 RUNNERS: dict[str, Callable[[Job], dict[str, Any]]] = {

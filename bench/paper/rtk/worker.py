@@ -1,13 +1,12 @@
 """One job in RTK's Python: `python -m bench.paper.rtk.worker FOLDER`.
 
 FOLDER holds job.json (task, threads, ...) and arrays.npz; the answer is answer.json and *.npy beside them. Imports of
-this module: numpy and RTK alone.
+this module: numpy and RTK alone, and what needs neither.
 """
 
 from __future__ import annotations
 
 import json
-import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bench.paper.rtk import bridge
+from bench.peak import peak_mib
 
 
 def main(folder: Path) -> None:
@@ -36,7 +36,7 @@ def main(folder: Path) -> None:
         for iterations, seconds, volume in found:
             np.save(folder / f"volume{iterations}.npy", volume)
             answer["snapshots"].append({"iterations": iterations, "seconds": seconds})
-    answer["peak_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    answer["peak_mib"] = peak_mib()
     answer["version"] = bridge.version()
     (folder / "answer.json").write_text(json.dumps(answer), encoding="utf-8")
 
