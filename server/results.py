@@ -13,7 +13,7 @@ from fastapi.responses import FileResponse
 from server import names, slices
 from server.problems import ApiProblem, invalid, not_found
 from server.service import Served, Service
-from worker.contract import State
+from worker.contract import ACTIVE, State
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
 
@@ -60,17 +60,22 @@ def get_slice(
     low: Annotated[float | None, Query(allow_inf_nan=False)] = None,
     high: Annotated[float | None, Query(allow_inf_nan=False)] = None,
 ) -> Response:
-    """One slice as an 8-bit PNG; z up for x and y, y up for z. `low` and `high` are in 1/mm."""
-    folder = _whole_or_partial(service, job_id)
+    """One slice as an 8-bit PNG; z up for x and y, y up for z. `low` and `high` are in 1/mm. While the job runs: of the
+    volume as it stood at the end of the last level, in that level's voxels."""
     if low is not None and high is not None and not low < high:
         raise invalid("low must be less than high.")
+    draft = _draft(service, job_id)
     try:
-        png = slices.render(folder, axis, index, low, high)
+        if draft is None:
+            folder = _whole_or_partial(service, job_id)
+            png = slices.render(folder / "volume.tif", axis, index, low, high, folder.parent / "window.json")
+        else:
+            png = slices.render(draft, axis, index, low, high)
     except IndexError:
         raise not_found("slice") from None
     except FileNotFoundError:
         raise not_found("volume") from None
-    return Response(png, media_type="image/png", headers=_FOREVER)
+    return Response(png, media_type="image/png", headers=_FOREVER if draft is None else _REVALIDATE)
 
 
 def _finished(service: Service, job_id: UUID) -> Folder:
@@ -92,6 +97,13 @@ def _partial(service: Service, job_id: UUID) -> Folder:
 
 def _whole_or_partial(service: Service, job_id: UUID) -> Folder:
     return _partial(service, job_id) if service.job(job_id).partial else _finished(service, job_id)
+
+
+def _draft(service: Service, job_id: UUID) -> Folder | None:
+    """Where the volume so far of a job under way is, if there is one."""
+    job = service.job(job_id)
+    draft = service.folder(job.id).draft
+    return draft if job.state in ACTIVE and draft.is_file() else None
 
 
 def _file(folder: Folder, file: str) -> Response:

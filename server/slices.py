@@ -18,14 +18,17 @@ _PERCENTILES = (0.5, 99.5)
 _AXES = {"z": 0, "y": 1, "x": 2}
 
 
-def render(results: Path, axis: str, index: int, low: float | None, high: float | None) -> bytes:
-    """Slice `index` along `axis` of the volume in a result folder.
+def render(
+    file: Path, axis: str, index: int, low: float | None, high: float | None, window: Path | None = None
+) -> bytes:
+    """Slice `index` along `axis` of a volume.
 
+    window: where the grey window of a volume that stays as it is is kept, once it was asked for.
     Raises IndexError outside the volume, FileNotFoundError without one."""
-    volume = _volume(results / "volume.tif")
+    volume = _volume(file)
     plane = volume[(slice(None),) * _AXES[axis] + (index,)]
     if low is None or high is None:
-        auto_low, auto_high = _window(results, volume)
+        auto_low, auto_high = _kept(window, volume) if window else _range(volume)
         low = auto_low if low is None else low
         high = auto_high if high is None else high
     return _png(np.asarray(plane, np.float32)[::-1], low, high)
@@ -33,28 +36,29 @@ def render(results: Path, axis: str, index: int, low: float | None, high: float 
 
 def _volume(path: Path) -> Any:
     """The volume [z, y, x], mapped. Our own engine wrote it, plain and contiguous."""
-    if not path.is_file():
-        raise FileNotFoundError(path)
-    with tifffile.TiffFile(path, is_ome=False) as tiff:
+    with path.open("rb") as file:  # once: a draft may be replaced at any moment
+        tiff = tifffile.TiffFile(file, is_ome=False)
         page, offset = tiff.pages.first, tiff.series[0].dataoffset
         if offset is None or page.dtype is None:
             raise ValueError(f"{path} is not one contiguous array")
         shape = (len(tiff.pages), *page.shape)
-        dtype = page.dtype.newbyteorder(tiff.byteorder)
-    return np.memmap(path, dtype, "r", offset, shape)
+        return np.memmap(file, page.dtype.newbyteorder(tiff.byteorder), "r", offset, shape)
 
 
-def _window(results: Path, volume: Any) -> tuple[float, float]:
-    """The default grey window: most of the volume's own range. Computed once, kept beside the results."""
-    cache = results.parent / "window.json"
+def _kept(window: Path, volume: Any) -> tuple[float, float]:
     try:
-        kept = json.loads(cache.read_bytes())
+        kept = json.loads(window.read_bytes())
         return float(kept["low"]), float(kept["high"])
     except (FileNotFoundError, ValueError, KeyError):
-        pass
+        low, high = _range(volume)
+    write_atomically(window, json.dumps({"low": low, "high": high}).encode())
+    return low, high
+
+
+def _range(volume: Any) -> tuple[float, float]:
+    """The default grey window: most of the volume's own range."""
     step = max(1, round((volume.size / _SAMPLE) ** (1 / 3)))
     low, high = (float(value) for value in np.percentile(volume[::step, ::step, ::step], _PERCENTILES))
-    write_atomically(cache, json.dumps({"low": low, "high": high}).encode())
     return low, high
 
 

@@ -15,9 +15,13 @@ import time
 from collections.abc import Callable, Iterable
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from splatcore.errors import CheckpointError, SplatCTError
+
+if TYPE_CHECKING:  # who only sets a wish need not wait for numpy
+    from splatcore.grid import VolumeGrid
+    from splatcore.splats import Floats
 
 EVERY_S = 10.0
 FILE = "run.checkpoint"
@@ -95,13 +99,18 @@ class Keeper:
             self.concluded = True
             raise Concluding
 
+    def show(self, draft: Callable[[], Floats], grid: VolumeGrid) -> bool:
+        """The volume as it stands, [z, y, x] 1/mm, for whoever would like to see it by now: True if it was taken.
+        Nobody here; calling `draft` is what costs."""
+        return False
+
     def forget(self) -> None:
         """The run has ended, and its result is kept: the state is of no more use."""
         if self.file is not None:
             self.file.unlink(missing_ok=True)
 
     def _write(self, file: Path, state: Callable[[], State]) -> None:
-        from splatcore import checkpoint  # not above: who only sets a wish need not wait for numpy
+        from splatcore import checkpoint
 
         began = self._clock()
         try:

@@ -18,6 +18,7 @@ class Progress:
     "done".
     message: one plain sentence.  loss: mean absolute residual in line-integral units.
     moved_deg, moved_mm: RMS change of the poses in the last sweep (stage "poses").
+    draft: the volume as it stands can be seen; its `shape` and `voxel_mm`, [z, y, x].
     """
 
     stage: str
@@ -30,6 +31,7 @@ class Progress:
     splats: int | None = None
     moved_deg: float | None = None
     moved_mm: float | None = None
+    draft: dict[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
         return {k: v for k, v in dataclasses.asdict(self).items() if v is not None}

@@ -50,6 +50,7 @@ from splatcore.trial import held_out_views
 
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
 _WORTH_THREADS = 4_000  # splats
+_MOST_SHOWN = 256**3  # voxels of a draft: more take seconds to make and to write
 _FAINTEST = 1e-30  # line integral; single precision has no room for the squares of less
 
 # What a checkpoint may hold beside plain values and arrays.
@@ -178,6 +179,20 @@ class _Run:
                 yield from parts[stage.kind](stage, self._here)
             self._stage, self._under_way, self._book = self._stage + 1, {}, None
             self._keeper.pause(self.state, stage_ends=True)
+            if stage.kind == "level" and self._stage < len(self._schedule.stages):
+                yield from self._show(self._here)
+
+    def _show(self, here: Level) -> Generator[Progress, None, None]:
+        """Let the volume be seen as it stands, in the voxels of the level."""
+        descent, grid = self._descent, here.grid
+        assert descent is not None
+        if grid.voxels > _MOST_SHOWN:
+            return
+        if self._keeper.show(lambda: descent.splats.voxelize(grid, self._threads), grid):
+            yield self.progress(
+                "level", f"binning {here.factor} is done", level=here.factor,
+                draft={"shape": list(grid.shape), "voxel_mm": list(grid.voxel_mm)},
+            )  # fmt: skip
 
     def _pause(self) -> None:
         self._keeper.pause(self.state)

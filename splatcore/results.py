@@ -11,6 +11,7 @@ import contextlib
 import hashlib
 import json
 import math
+import os
 import platform
 import tempfile
 import zipfile
@@ -40,6 +41,7 @@ from splatcore.tiff import read_stack
 __all__ = ["Results", "prepare_folder", "read_results", "write_results"]
 
 FORMAT = "splatct-result/1"
+_NEXT = 1 << 16  # bytes; more than what is left of a block
 _MANIFEST = "manifest.json"
 
 
@@ -94,7 +96,7 @@ def write_results(reconstruction: Reconstruction, folder: Path | str, overwrite:
     if r.volume.shape != r.grid.shape:
         raise ResultError(f"the volume has shape {r.volume.shape}, its grid {r.grid.shape}")
     writers: dict[str, Callable[[BinaryIO], None]] = {
-        "volume.tif": lambda file: _write_volume(file, r.volume, r.grid),
+        "volume.tif": lambda file: write_volume(file, r.volume, r.grid),
         "splats.npz": lambda file: _write_splats(file, r.splats),
         "poses.json": lambda file: _write_json(file, poses_document(r)),
         "report.json": lambda file: _write_json(file, r.report),
@@ -152,26 +154,33 @@ def read_results(folder: Path | str, verify: bool = False) -> Results:
     return Results(folder, volume, grid, frames, poses, splats, report, manifest)
 
 
-def _write_volume(file: BinaryIO, volume: NDArray[np.float32], grid: VolumeGrid) -> None:
+def write_volume(file: BinaryIO, volume: NDArray[np.float32], grid: VolumeGrid) -> None:
     """Plain contiguous pages; voxel size as resolution (per centimetre) and in the description."""
     z_mm, y_mm, x_mm = grid.voxel_mm
-    tifffile.imwrite(
-        file,
-        np.ascontiguousarray(volume, np.float32),
-        bigtiff=True,
-        photometric="minisblack",
-        resolution=(10 / x_mm, 10 / y_mm),
-        resolutionunit="CENTIMETER",
-        software=f"SplatCT {splatcore.__version__}",
-        metadata={
-            "axes": "ZYX",
-            "unit": "mm",
-            "spacing": z_mm,
-            "voxel_mm": list(grid.voxel_mm),
-            "center_mm": list(grid.center_mm),
-            "quantity": "attenuation, 1/mm",
-        },
-    )
+    try:
+        tifffile.imwrite(
+            file,
+            np.ascontiguousarray(volume, np.float32),
+            bigtiff=True,
+            photometric="minisblack",
+            resolution=(10 / x_mm, 10 / y_mm),
+            resolutionunit="CENTIMETER",
+            software=f"SplatCT {splatcore.__version__}",
+            metadata={
+                "axes": "ZYX",
+                "unit": "mm",
+                "spacing": z_mm,
+                "voxel_mm": list(grid.voxel_mm),
+                "center_mm": list(grid.center_mm),
+                "quantity": "attenuation, 1/mm",
+            },
+        )
+    except OSError as error:
+        if error.errno is None:  # numpy tells how much it wrote, not why no more: the next bytes do
+            file.seek(0, os.SEEK_END)
+            file.write(bytes(_NEXT))
+            file.flush()
+        raise
 
 
 def _write_splats(file: BinaryIO, splats: Splats) -> None:

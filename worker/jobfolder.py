@@ -8,6 +8,7 @@ JOBDIR/events.jsonl   progress, one JSON object per line
 JOBDIR/log.txt        the engine's stderr
 JOBDIR/attempt-N/     results in the making
 JOBDIR/run.checkpoint the engine's state, from which the next attempt goes on
+JOBDIR/draft.tif      the volume as it stood at the end of a level, to be seen while the run goes on
 JOBDIR/partial/       what a run had when it was cancelled or its time was up; complete like results/
 JOBDIR/results/       published; complete from the moment it exists
 """
@@ -77,6 +78,7 @@ class JobFolder:
         self.results = self.path / "results"
         self.partial = self.path / "partial"
         self.checkpoint = self.path / "run.checkpoint"
+        self.draft = self.path / "draft.tif"
 
     def create(self, scan: Path) -> None:
         """Lay out the folder with the files of the committed scan in it."""
@@ -168,7 +170,8 @@ class JobFolder:
         self.discard_attempts()
         shutil.rmtree(self.scratch, ignore_errors=True)
         shutil.rmtree(self.scan, ignore_errors=True)
-        self.cancel.unlink(missing_ok=True)
+        for file in (self.cancel, self.draft, self.draft.with_suffix(".part")):
+            file.unlink(missing_ok=True)
         if self.published():
             self.checkpoint.unlink(missing_ok=True)
         self.checkpoint.with_name(f".{self.checkpoint.name}.part").unlink(missing_ok=True)

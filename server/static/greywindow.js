@@ -11,18 +11,22 @@ const STEPS = 500;
 export class GreyWindow {
   constructor(onChange) {
     this.onChange = onChange;
+    this.chosen = false; // by the user, who keeps it when another volume is shown
     byId("window").addEventListener("submit", (event) => event.preventDefault());
-    byId("auto").addEventListener("click", () => this.set(...this.automatic));
+    byId("auto").addEventListener("click", () => {
+      this.chosen = false;
+      this.set(...this.automatic);
+    });
     byId("low").addEventListener("input", () => this.keepApart("low"));
     byId("high").addEventListener("input", () => this.keepApart("high"));
   }
 
-  // `slice` is the address of a typical slice.
+  // `slice` gives the address of a typical slice, drawn with a window.
   async measure(slice) {
     let [low, high] = FIRST;
     let counts = [];
     for (let look = 0; look < LOOKS; look += 1) {
-      counts = histogram(await load(`${slice}?low=${low}&high=${high}`));
+      counts = histogram(await load(slice({ low, high })));
       if (look + 1 === LOOKS) break;
       const step = (high - low) / 255;
       const first = counts.findIndex((count) => count > 0);
@@ -32,8 +36,9 @@ export class GreyWindow {
     const at = (share) => low + (percentile(counts, share) / 255) * (high - low);
     this.automatic = [at(0.005), at(0.998)];
     this.gap = (high - low) / STEPS;
+    const { low: black, high: white } = this.window;
     for (const id of ["low", "high"]) Object.assign(byId(id), { min: low, max: high, step: this.gap });
-    this.set(...this.automatic);
+    this.set(...(this.chosen ? [black, white] : this.automatic));
   }
 
   set(low, high) {
@@ -44,6 +49,7 @@ export class GreyWindow {
 
   // Black stays below white: the one that is moved pushes the other.
   keepApart(moved) {
+    this.chosen = true;
     const low = byId("low");
     const high = byId("high");
     if (high.valueAsNumber - low.valueAsNumber < this.gap) {
@@ -64,8 +70,8 @@ export class GreyWindow {
     this.onChange();
   }
 
-  get query() {
-    return `?low=${byId("low").valueAsNumber}&high=${byId("high").valueAsNumber}`;
+  get window() {
+    return { low: byId("low").valueAsNumber, high: byId("high").valueAsNumber };
   }
 }
 

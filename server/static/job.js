@@ -17,6 +17,7 @@ const STAGES = [["read", "Read"], ["start", "First volume"], ["level", "Fit spla
 
 const actions = new Actions(url, show);
 let live = null;
+let draftShown = null;
 let endShown = false;
 
 function show(job) {
@@ -103,6 +104,7 @@ async function refresh() {
   if (job.state !== "queued" || job.attempt > 1) {
     await curves().refresh();
     showCurves(job);
+    if (!finished(job)) showDraft();
   }
   await showEnd(job);
   return finished(job) ? null : 2000;
@@ -112,11 +114,20 @@ function showCurves(job) {
   byId("live").hidden = live === null || (finished(job) && live.last === 0);
 }
 
+// The volume as it stands. It may be gone again when it is asked for: the next one, or the end, is told of, too.
+function showDraft() {
+  const draft = live.draft;
+  if (draft === draftShown) return;
+  draftShown = draft;
+  showSlices(id, draft.draft.voxel_mm, draft.number).catch(() => setText(byId("slices-heading"), "Volume so far, not shown"));
+}
+
 // What only a job that has ended has: results, whole or partial, and another run.
 async function showEnd(job) {
   if (!finished(job) || endShown) return;
   endShown = true;
   const kind = job.state === "succeeded" ? "results" : job.links?.partial ? "partial" : null;
+  if (kind === null) byId("slices").hidden = true; // what was shown is no longer there
   await actions.known;
   const parts = [kind ? showResults(kind) : null, actions.may("submit") ? offerAgain(url, job) : null];
   const failed = (await Promise.allSettled(parts)).filter((part) => part.status === "rejected");
@@ -137,6 +148,7 @@ async function begin() {
     take(event) {
       curves().takeNext(event);
       byId("live").hidden = false;
+      showDraft();
     },
     show,
     async end(job) {

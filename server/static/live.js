@@ -11,6 +11,7 @@ export class Live {
     this.url = `/v1/jobs/${encodeURIComponent(jobId)}/events`;
     this.last = 0;
     this.drawing = null;
+    this.draft = null; // the newest event that told of a volume to be seen
     this.restart();
     this.loss = chart({ title: "Residual", xLabel: "step", yLabel: "mean |residual|" });
     this.turn = chart({ title: "Pose motion, rotation", xLabel: "sweep", yLabel: "RMS change, °" });
@@ -44,6 +45,7 @@ export class Live {
       if (event.step < this.step) this.before += this.step; // steps are counted per level
       this.step = event.step;
     }
+    if (event.draft) this.draft = event;
     const x = this.before + this.step;
     if (event.level && event.level !== this.level) {
       this.level = event.level;

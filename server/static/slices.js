@@ -10,31 +10,45 @@ const AXES = [
   { axis: "x", name: "Sagittal", across: "y", up: "z" },
 ];
 
-// `voxel` is [z, y, x] in mm; slices of voxels that are no cubes are stretched to their true shape.
-export async function showSlices(jobId, voxel = [1, 1, 1]) {
+const grey = new GreyWindow(() => panes.forEach((pane) => pane.refresh()));
+let panes = [];
+let turn = 0;
+
+// `voxel` is [z, y, x] in mm; slices of voxels that are no cubes are stretched to their true shape. `draft` is the number
+// of the event that told of the volume, where it is one that the run has not finished.
+export async function showSlices(jobId, voxel = [1, 1, 1], draft = null) {
+  const mine = (turn += 1);
   const base = `/v1/jobs/${encodeURIComponent(jobId)}/slices`;
-  const [axial, coronal] = await Promise.all([load(`${base}/z/0.png`), load(`${base}/y/0.png`)]);
+  const address = (axis, index, window = {}) => {
+    const query = new URLSearchParams(draft === null ? window : { ...window, draft }); // each draft its own address
+    return `${base}/${axis}/${index}.png?${query}`;
+  };
+  const [axial, coronal] = await Promise.all([load(address("z", 0)), load(address("y", 0))]);
   const size = { x: axial.naturalWidth, y: axial.naturalHeight, z: coronal.naturalHeight };
-  let panes = [];
-  const grey = new GreyWindow(() => panes.forEach((pane) => pane.refresh()));
-  await grey.measure(`${base}/z/${Math.floor(size.z / 2)}.png`);
+  if (mine !== turn) return; // a newer volume has overtaken this one
+  const where = Object.fromEntries(panes.map((pane) => [pane.axis, pane.share]));
+  await grey.measure((window) => address("z", Math.floor(size.z / 2), window));
+  if (mine !== turn) return;
   const mm = { z: voxel[0], y: voxel[1], x: voxel[2] };
   panes = AXES.map((view) => {
     const shape = (size[view.across] * mm[view.across]) / (size[view.up] * mm[view.up]);
-    return makePane(base, view, size[view.axis], grey, shape);
+    return makePane(address, view, size[view.axis], where[view.axis] ?? 0.5, shape);
   });
+  const extent = `${size.x} × ${size.y} × ${size.z} voxels`;
+  setText(byId("slices-heading"), draft === null ? "Volume" : `Volume so far, ${extent}`);
   byId("views").replaceChildren(...panes.map((pane) => pane.node));
   byId("slices").hidden = false;
   panes.forEach((pane) => pane.refresh());
 }
 
-function makePane(base, { axis, name, across, up }, count, grey, shape) {
+// `share`: of the way through the volume.
+function makePane(address, { axis, name, across, up }, count, share, shape) {
   const picture = el("img", { class: "slice", alt: "" });
   const box = el("div", { class: "slice-box" }, picture);
   picture.style.aspectRatio = String(shape);
   picture.style[shape < 1 ? "height" : "width"] = "100%";
   const slider = el("input", {
-    type: "range", min: 0, max: count - 1, value: Math.floor(count / 2), "aria-label": `${name} slice, ${axis}`,
+    type: "range", min: 0, max: count - 1, value: Math.round((count - 1) * share), "aria-label": `${name} slice, ${axis}`,
   });
   const where = el("output", {});
   let busy = false;
@@ -43,7 +57,7 @@ function makePane(base, { axis, name, across, up }, count, grey, shape) {
   // One request at a time; while it runs only the newest wish is kept.
   async function refresh() {
     setText(where, `${axis} ${slider.value} of ${count - 1}`);
-    wanted = `${base}/${axis}/${slider.value}.png${grey.query}`;
+    wanted = address(axis, slider.value, grey.window);
     if (busy) return;
     busy = true;
     while (wanted) {
@@ -59,8 +73,18 @@ function makePane(base, { axis, name, across, up }, count, grey, shape) {
     busy = false;
   }
 
-  slider.addEventListener("input", refresh);
+  slider.addEventListener("input", () => {
+    share = slider.valueAsNumber / Math.max(count - 1, 1);
+    refresh();
+  });
   const axes = el("span", { class: "muted" }, `${across} →, ${up} ↑`);
   const caption = el("figcaption", {}, el("strong", {}, name), axes, el("span", { class: "muted" }, where));
-  return { node: el("figure", { class: "view" }, caption, box, slider), refresh };
+  return {
+    axis,
+    node: el("figure", { class: "view" }, caption, box, slider),
+    get share() {
+      return share;
+    },
+    refresh,
+  };
 }

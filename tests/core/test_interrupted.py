@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from splatcore.checkpoint import identity
+from splatcore.grid import VolumeGrid
 from splatcore.keeper import Keeper, Stopped, Wish
 from splatcore.options import Options
 from splatcore.progress import Progress
@@ -21,6 +22,7 @@ from splatcore.reconstruction import Reconstruction
 from splatcore.results import write_results
 from splatcore.scan import Scan
 from splatcore.simulate import Simulation
+from splatcore.splats import Floats
 
 from .phantom import scan_of
 
@@ -206,6 +208,30 @@ def test_a_state_that_cannot_be_written_ends_no_run(scan: Scan, tmp_path: Path) 
         assert end.value.volume.any()
     troubles = [event.message for event in said if event.stage == "checkpoint"]
     assert troubles and "cannot be written" in troubles[0] and "No such file" in troubles[0]
+
+
+def test_the_volume_is_shown_as_it_stands(scan: Scan) -> None:
+    class Watching(Keeper):
+        def show(self, draft: Callable[[], Floats], grid: VolumeGrid) -> bool:
+            shown.append((draft(), grid))
+            return True
+
+    shown: list[tuple[Floats, VolumeGrid]] = []
+    told = []
+    events = reconstruct(scan, WHOLE, Watching())
+    try:
+        while True:
+            told.append(next(events))
+    except StopIteration as end:
+        result = end.value
+    drafts = [event for event in told if event.draft]
+    assert [event.level for event in drafts] == [2, 1]
+    assert [event.draft["shape"] for event in drafts if event.draft] == [[14, 14, 14], [28, 28, 28]]
+    assert [grid.to_json()["shape"] for _, grid in shown] == [[14, 14, 14], [28, 28, 28]]
+    mass = [float(volume.sum()) * np.prod(grid.voxel_mm) for volume, grid in shown]
+    np.testing.assert_allclose(mass, float(result.volume.sum()) * np.prod(result.grid.voxel_mm), rtol=0.03)
+    change = np.abs(shown[-1][0] - result.volume)  # by the last stage, which was still to come
+    assert 0 < change.max() < 0.3 * result.volume.max() and change.mean() < 0.02 * result.volume.max()
 
 
 def test_writing_costs_less_than_a_hundredth() -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import json
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from splatcore.grid import VolumeGrid
 from splatcore.options import Options
 from splatcore.posefile import read_poses
 from splatcore.reconstruction import Reconstruction
-from splatcore.results import prepare_folder, read_results, write_results
+from splatcore.results import prepare_folder, read_results, write_results, write_volume
 from splatcore.splats import Splats
 
 VIEWS = 5
@@ -201,6 +203,19 @@ def test_a_failed_write_leaves_no_manifest(tmp_path: Path, monkeypatch: pytest.M
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"manifest.json"}
     with pytest.raises(ResultError, match=r"manifest\.json: cannot be read"):
         read_results(tmp_path)
+
+
+def test_a_volume_that_is_cut_short_tells_why(tmp_path: Path) -> None:
+    """numpy raises an error without a number; whether a disk was full decides what becomes of the job."""
+    edge, limits = 64, resource.getrlimit(resource.RLIMIT_FSIZE)
+    volume, grid = np.zeros((edge, edge, edge), np.float32), VolumeGrid((edge, edge, edge), (1.0, 1.0, 1.0))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (volume.nbytes // 2, limits[1]))
+    try:
+        with pytest.raises(OSError, match="too large") as raised, (tmp_path / "volume.tif").open("wb") as file:
+            write_volume(file, volume, grid)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert raised.value.errno == errno.EFBIG
 
 
 @pytest.mark.parametrize("name", sorted(FILES - {"manifest.json"}))

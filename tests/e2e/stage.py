@@ -70,6 +70,13 @@ class Stage:
         folder.publish(1)
         assert self.ledger.succeed(job_id, 1)
 
+    def show_draft(self, job_id: str, edge: int) -> None:
+        """A cube of so many voxels a side, as the engine leaves it at the end of a level."""
+        volume = np.full((edge, edge, edge), 0.02, np.float32)
+        tifffile.imwrite(JobFolder(self.data, job_id).draft, volume, photometric="minisblack", metadata=None)
+        draft = {"shape": [edge] * 3, "voxel_mm": [1.6, 1.0, 1.0]}
+        self.say(job_id, stage="level", fraction=0.5, message=f"{edge} voxels", draft=draft)
+
     def end_early(self, job_id: str) -> None:
         """Cancelled, with what it had."""
         assert self.ledger.ask_cancel(job_id)

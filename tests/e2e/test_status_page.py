@@ -7,7 +7,7 @@ import time
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from worker.contract import State
+from worker.contract import ErrorKind, State
 
 from .chromium import NEEDED
 from .stage import Stage, progress_events
@@ -82,6 +82,39 @@ def test_a_job_from_the_queue_to_its_results(page: Page, stage: Stage) -> None:
     expect(page.locator("#file-rows tr")).to_have_count(5)
     expect(page.locator("#progress-panel")).to_be_hidden()
     check_slices(page)
+
+
+def test_the_volume_so_far_is_shown_and_sharpens(page: Page, stage: Stage) -> None:
+    job = stage.job("teapot")
+    stage.start(job)
+    page.goto(f"/jobs/{job}")
+    expect(page.locator("#state")).to_have_text("running")
+    expect(page.locator("#slices")).to_be_hidden()
+    stage.show_draft(job, 8)
+    expect(page.get_by_role("heading", name="Volume so far, 8 × 8 × 8 voxels")).to_be_visible()
+    axial = page.get_by_role("img", name="Axial slice at z 4 of 7")
+    expect(axial).to_be_visible()
+    assert axial.evaluate("image => image.naturalWidth") == 8
+    page.get_by_role("slider", name="Axial slice, z").press("End")
+    expect(page.get_by_role("img", name="Axial slice at z 7 of 7")).to_be_visible()
+    stage.show_draft(job, 16)  # the slider stays where it was, as a share of the volume
+    expect(page.get_by_role("img", name="Axial slice at z 15 of 15")).to_be_visible()
+    page.reload()  # who comes later sees it, too
+    expect(page.get_by_role("heading", name="Volume so far, 16 × 16 × 16 voxels")).to_be_visible()
+    stage.finish(job)
+    expect(page.get_by_role("heading", name="Volume", exact=True)).to_be_visible()
+    expect(page.get_by_role("img", name="Axial slice at z 20 of 39")).to_be_visible()
+
+
+def test_a_draft_goes_with_a_job_that_leaves_nothing(page: Page, stage: Stage) -> None:
+    job = stage.job("teapot")
+    stage.start(job)
+    stage.show_draft(job, 8)
+    page.goto(f"/jobs/{job}")
+    expect(page.get_by_role("heading", name="Volume so far, 8 × 8 × 8 voxels")).to_be_visible()
+    assert stage.ledger.fail(job, 1, ErrorKind.CRASHED, "It died")
+    expect(page.locator("#state")).to_have_text("failed")
+    expect(page.locator("#slices")).to_be_hidden()
 
 
 def check_slices(page: Page) -> None:

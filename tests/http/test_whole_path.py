@@ -109,6 +109,25 @@ def test_a_failed_job_says_why_and_has_no_results(shared: Stack) -> None:
     assert answer.status_code == 409 and answer.json()["type"] == "urn:splatct:problem:no-results"
 
 
+def test_the_volume_so_far(shared: Stack) -> None:
+    job_id = submit(shared.http, commit(shared.http, scan_files(steps=1000, pause=0.05, draft_at=2)))
+    url = f"/v1/jobs/{job_id}/slices/y/2.png?low=0&high=0.2"
+    assert shared.http.get(url).status_code == 409  # nothing to be seen yet
+    shared.until(
+        lambda: any("draft" in e for e in shared.http.get(f"/v1/jobs/{job_id}/events").json()["events"]), 20, "draft"
+    )
+    answer = shared.http.get(url)
+    assert answer.status_code == 200 and "immutable" not in answer.headers["cache-control"]
+    picture = np.asarray(Image.open(io.BytesIO(answer.content)))
+    assert picture.shape == (2, 4) and (picture == 127).all()
+    assert shared.http.get(f"/v1/jobs/{job_id}/slices/z/2.png").status_code == 404
+    shared.http.post(f"/v1/jobs/{job_id}/cancel")
+    job = shared.wait(job_id, "cancelled")
+    assert not (shared.data / "jobs" / job_id / "draft.tif").exists()
+    assert "partial" in job["links"]  # which has its own volume
+    assert np.asarray(Image.open(io.BytesIO(shared.http.get(url).content))).shape == (5, 7)
+
+
 def test_cancel_a_running_job(shared: Stack) -> None:
     job_id = submit(shared.http, commit(shared.http, scan_files(steps=5000, pause=0.05)))
     shared.wait(job_id, "running")

@@ -6,10 +6,15 @@ import time
 from collections.abc import Generator
 from typing import Any
 
+import numpy as np
+
 from splatcore.errors import ReconstructionError
+from splatcore.grid import VolumeGrid
 from splatcore.keeper import Concluding, Keeper
 from splatcore.options import Options
 from splatcore.progress import Progress
+
+DRAFT = VolumeGrid((2, 3, 4), (1.0, 1.0, 1.0))
 
 
 def reconstruct(plan: dict[str, Any], options: Options, keeper: Keeper) -> Generator[Progress, None, dict[str, Any]]:
@@ -33,6 +38,8 @@ def reconstruct(plan: dict[str, Any], options: Options, keeper: Keeper) -> Gener
             time.sleep(plan.get("pause", 0.0))
             fraction = (step + 1) / (steps + 1)
             yield Progress("level", fraction, f"Step {step + 1} of {steps}", step=step, loss=1 / (step + 1))
+            if plan.get("draft_at") == step and keeper.show(lambda: np.full((2, 3, 4), 0.1, np.float32), DRAFT):
+                yield Progress("level", fraction, "To be seen", draft={"shape": [2, 3, 4], "voxel_mm": [1, 1, 1]})
             if plan.get("dies_at") == step and state is None:
                 os.kill(os.getpid(), signal.SIGSEGV)
     except Concluding:
