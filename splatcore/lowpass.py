@@ -3,6 +3,9 @@
 What a residual holds beyond that is the model's own error, largest where a view looks along a flat face, and it
 drags the view there by several times its standard deviation. Noise beyond that says nothing about a pose: at such
 frequencies a view shares too few coefficients with the others (docs/method/uncertainty.md).
+
+An edge of splats is softer than the object's, too, and a view along a face can make it sharper by turning. So the
+poses see no part of a residual that a sharper or softer image of the same splats would explain.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from splatcore import _native
-from splatcore.geometry import Frames
+from splatcore.geometry import Array, Frames
 from splatcore.pyramid import Level, means_of_blocks
 from splatcore.splats import Floats, Splats
 from splatcore.uncertainty import extent
@@ -22,6 +25,9 @@ _TAILS = 3.0  # standard deviations at which the filter's kernel ends
 _BINNING = 2
 _SPLATS = 1.5  # largest width of the filter, in sizes of the median splat
 _SHARED = 0.25  # and in wavelengths of the finest detail that views share: it passes half at three quarters of that
+_TILE = 16  # binned pixels along a side, of the pieces of a view that may each be blurred by an amount of their own
+_BLUR = 0.03  # expected size of these amounts, where nothing is seen of them; half a squared binned pixel
+_NORMAL, _HUBER = 1.2533, 2.0  # as in splatcore.calibration
 _LEAST = 1.0  # pixels; a filter that would be narrower is left out
 
 
@@ -61,7 +67,8 @@ def low_passed(
         renderer.render(packed[k], cone, *splats.arrays(), image)
         fine.render(packed_small[k], cone, *splats.arrays(), drawn)
         residual = (image - target) * weights
-        filtered = _filtered(means_of_blocks(residual[None], binning)[0], sigmas) / norm
+        binned = _filtered(means_of_blocks(residual[None], binning)[0], sigmas)
+        filtered = _without_blur((binned / norm).astype(np.float32, copy=False), drawn, coarse)
         images[k] = drawn - filtered
         rough += float(np.abs(residual).sum())
         smooth += float((np.abs(filtered) * coarse).sum())
@@ -83,6 +90,36 @@ def _width(splats: Splats, views: int) -> float:
     median = float(np.median(np.exp(np.log(splats.scales).mean(axis=1))))
     diameter = 4 * float(np.sqrt(np.linalg.eigvalsh(extent(splats))[-1]))
     return min(_SPLATS * median, _SHARED * np.pi * diameter / views)
+
+
+def _without_blur(residual: Floats, drawn: Floats, weights: Floats) -> Floats:
+    """The residual less what it would be to blur or to sharpen `drawn` along rows and along columns, by an amount of
+    its own in every tile: the least squares of both, outliers hardly counted. All [rows, cols]."""
+    deviation = _NORMAL * float((np.abs(residual) * weights).mean()) / max(float(weights.mean()), 1e-6)
+    weights = weights * np.minimum(1, _HUBER * deviation / np.maximum(np.abs(residual), 1e-20))
+    curved = [_curvature(drawn, axis) for axis in (0, 1)]
+    starts = [np.arange(0, n, _TILE) for n in residual.shape]
+
+    def sums(image: Floats) -> Array:
+        return np.add.reduceat(np.add.reduceat(image, starts[0], axis=0), starts[1], axis=1).astype(np.float64)
+
+    weighted = [weights * each for each in curved]
+    normal = np.array([[sums(a * b) for b in curved] for a in weighted]).transpose(2, 3, 0, 1)  # [., ., 2, 2]
+    right = np.array([sums(a * residual) for a in weighted]).transpose(1, 2, 0)
+    ridge = (deviation / _BLUR) ** 2 + 1e-30
+    amounts = np.linalg.solve(normal + ridge * np.eye(2), right[..., None])[..., 0].astype(np.float32)
+    sizes = [np.diff(np.append(start, n)) for start, n in zip(starts, residual.shape, strict=True)]
+    rows, cols = (np.repeat(np.repeat(amounts[..., k], sizes[0], axis=0), sizes[1], axis=1) for k in (0, 1))
+    out: Floats = residual - rows * curved[0] - cols * curved[1]
+    return out
+
+
+def _curvature(image: Floats, axis: int) -> Floats:
+    """Second differences along an axis, zero at its ends."""
+    out = np.zeros_like(image)
+    inner, along = np.moveaxis(out, axis, 0), np.moveaxis(image, axis, 0)
+    inner[1:-1] = along[2:] - 2 * along[1:-1] + along[:-2]
+    return out
 
 
 def _filtered(image: Floats, sigmas: list[float]) -> Floats:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatcore import _native
+from splatcore import _native, lowpass
 from splatcore.geometry import circular
 from splatcore.grid import VolumeGrid
-from splatcore.lowpass import low_passed
+from splatcore.lowpass import _without_blur, low_passed
 from splatcore.pyramid import Level
 from splatcore.splats import Splats
 
@@ -56,7 +56,8 @@ def test_an_object_that_fits_leaves_nothing():
     np.testing.assert_allclose(residual(soft, splats), 0, atol=1e-6 * here.images.max())
 
 
-def test_residuals_are_binned_and_filtered_as_wide_as_the_splats():
+def test_residuals_are_binned_and_filtered_as_wide_as_the_splats(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(lowpass, "_without_blur", lambda residual, *_: residual)  # which has a test of its own
     splats, renderer, here = scene()
     noise = np.random.default_rng(1).normal(0, 0.1, here.images.shape).astype(np.float32)
     noisy = Level(1, (1, 1), here.nominal, here.images + noise, None, here.grid)
@@ -69,6 +70,19 @@ def test_residuals_are_binned_and_filtered_as_wide_as_the_splats():
     assert soft.rough == pytest.approx(np.abs(noise).mean(), rel=1e-4)
     inside = residual(soft, splats)[:, 8:-8, 8:-8]
     assert soft.shared * inside.var() == pytest.approx(binned.var(), rel=0.25)  # of which few are independent
+
+
+def test_what_blur_explains_is_taken_out_and_what_motion_explains_is_not():
+    here = scene()[2]
+    image, good = here.images[0], np.ones((EDGE, EDGE), np.float32)
+    left, right, up, down = (np.roll(image, *way) for way in ((-1, 1), (1, 1), (-1, 0), (1, 0)))
+    amounts = np.repeat(np.repeat(np.random.default_rng(3).uniform(-0.1, 0.1, (4, 4)), 16, axis=0), 16, axis=1)
+    blurred = (amounts * (left - 2 * image + right) + 0.05 * (up - 2 * image + down)).astype(np.float32)
+    shifted = 0.05 * (left - right)
+    assert np.linalg.norm(_without_blur(blurred, image, good)) < 0.1 * np.linalg.norm(blurred)
+    kept = _without_blur(shifted, image, good)  # tiles cut through blobs, so that a little is lost
+    assert float((kept * shifted).sum()) > 0.95 * float((shifted * shifted).sum())
+    np.testing.assert_array_equal(_without_blur(np.zeros_like(image), image, good), 0)
 
 
 def test_bad_pixels_have_no_say():
