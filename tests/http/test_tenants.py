@@ -19,7 +19,7 @@ from .stack import Stack, announce, commit, scan_files, submit
 
 NO_IDS = {  # nothing in the request names a thing; what they list is tested below
     "GET /", "GET /healthz", "GET /readyz", "GET /metrics", "GET /openapi.json", "HEAD /openapi.json",
-    "GET /v1/options", "GET /v1/jobs", "GET /v1/scans", "POST /v1/uploads", "OPTIONS /v1/uploads",
+    "GET /v1/options", "GET /v1/jobs", "GET /v1/events", "GET /v1/scans", "POST /v1/uploads", "OPTIONS /v1/uploads",
     "GET /sign-in", "GET /v1/usage", "GET /v1/webhooks", "POST /v1/webhooks",
     "POST /v1/session", "GET /v1/session", "DELETE /v1/session",
     "GET /jobs/{job_id}",  # a shell that is the same for every id
