@@ -48,8 +48,9 @@ class Intake:
         return folder if folder.is_dir() else self._scans / upload_id
 
     def create(self, upload_id: str) -> None:
+        """Harmless when that has been done."""
         for name in ("parts", "scan"):
-            (self._uploads / upload_id / name).mkdir(parents=True)
+            (self._uploads / upload_id / name).mkdir(parents=True, exist_ok=True)
         (self._uploads / upload_id / ".lock").touch()
 
     @contextlib.contextmanager

@@ -10,7 +10,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
 
 from server.adding import file_out
-from server.announce import announced, open_upload, require_scan_json
+from server.announce import announced, open_once, open_upload, require_scan_json
 from server.checking import CheckFailed, check_scan
 from server.intake import Busy, Gone, Mismatch
 from server.partial import Part, remove_part
@@ -32,11 +32,18 @@ FileName = Annotated[str, Path(max_length=1024)]
 
 @router.post("", status_code=201)
 def create_upload(body: UploadIn, service: Served, response: Response) -> UploadOut:
-    files = announced(body.files)
-    if not body.growing:
-        require_scan_json(files)
-    upload = open_upload(service, body.name, files)
+    upload = open_upload(service, body.name, _files(body))
     response.headers["Location"] = f"/v1/uploads/{upload.id}"
+    return upload_out(upload)
+
+
+@router.put("/{upload_id}", status_code=201)
+def put_upload(upload_id: UUID, body: UploadIn, service: Served, response: Response) -> UploadOut:
+    """The same under an id of the client's own. Repeated with the same body: the upload; with another: 409."""
+    upload, replayed = open_once(service, str(upload_id), body.name, _files(body))
+    response.headers["Location"] = f"/v1/uploads/{upload.id}"
+    if replayed:
+        response.headers["Idempotency-Replayed"] = "true"
     return upload_out(upload)
 
 
@@ -152,6 +159,13 @@ def _settled(service: Service, upload_id: str, file: File, part: Part) -> str:
 
 def _committed() -> ApiProblem:
     return ApiProblem(409, "committed", "The upload is committed; its files can no longer change.")
+
+
+def _files(body: UploadIn) -> list[File]:
+    files = announced(body.files)
+    if not body.growing:
+        require_scan_json(files)
+    return files
 
 
 def _upload(service: Service, upload_id: UUID) -> Upload:
