@@ -27,6 +27,7 @@ def run(args: argparse.Namespace) -> int:
 
     from server import logs
     from server.app import create_app
+    from server.heap import leave_what_is_loaded, share_one_heap
     from server.opening import make_ready
     from server.settings import Settings
     from server.wire import uvicorn_config
@@ -34,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.tie_to is not None:
         die_with_parent(args.tie_to, signal.SIGTERM)
+    share_one_heap()
     given = {name: getattr(args, name) for name in ("data", "host", "port")}
     settings = Settings.read(given)
     os.umask(0o077)
@@ -53,5 +55,6 @@ def run(args: argparse.Namespace) -> int:
 
     config = uvicorn_config(app, settings.host, settings.port, forwarded_allow_ips=settings.trusted_proxies)
     server = Server(config)
+    leave_what_is_loaded()
     server.run()
     return 0 if server.started else 3
