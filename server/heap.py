@@ -1,9 +1,8 @@
-"""How the server's process holds memory, so that it does not grow with the requests it has answered."""
+"""Keeps the C library from growing a heap for each thread."""
 
 from __future__ import annotations
 
 import ctypes
-import gc
 
 _M_ARENA_MAX = -8  # malloc.h
 
@@ -15,10 +14,3 @@ def share_one_heap() -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, 1)
-
-
-def leave_what_is_loaded() -> None:
-    """Once all is loaded. The collector looks at old objects only when a quarter as many have grown old since; modules
-    have more than a hundred thousand, so that much rubbish would wait, and the process hold as much as ever waited."""
-    gc.collect()
-    gc.freeze()

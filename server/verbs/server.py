@@ -27,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
 
     from server import logs
     from server.app import create_app
-    from server.heap import leave_what_is_loaded, share_one_heap
+    from server.heap import share_one_heap
     from server.opening import make_ready
     from server.settings import Settings
     from server.wire import uvicorn_config
@@ -55,6 +55,5 @@ def run(args: argparse.Namespace) -> int:
 
     config = uvicorn_config(app, settings.host, settings.port, forwarded_allow_ips=settings.trusted_proxies)
     server = Server(config)
-    leave_what_is_loaded()
     server.run()
     return 0 if server.started else 3
