@@ -9,9 +9,11 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 
+from sqlalchemy.exc import IntegrityError
+
 from server import names
 from server.contents import find
-from server.problems import ApiProblem, invalid
+from server.problems import ApiProblem, invalid, not_found
 from server.schema import FileIn
 from server.service import Service
 from server.settings import MIB
@@ -38,12 +40,32 @@ def require_scan_json(files: Sequence[File]) -> None:
         )
 
 
-def open_upload(service: Service, name: str, files: list[File]) -> Upload:
+def open_once(service: Service, upload_id: str, name: str, files: list[File]) -> tuple[Upload, bool]:
+    """The upload of an id that the client chose, and whether an earlier request made it."""
+    earlier = service.store.upload(upload_id)
+    if earlier is None:
+        try:
+            return open_upload(service, name, files, upload_id), False
+        except IntegrityError:  # another request made it just now, or another tenant has one of this id
+            earlier = service.store.upload(upload_id)
+            if earlier is None:
+                raise not_found("upload") from None
+    told = [(file.name, file.size, file.expected_sha256) for file in earlier.files[: len(files)]]
+    if (earlier.name, told) != (name, [(file.name, file.size, file.expected_sha256) for file in files]):
+        hint = "repeat a request unchanged, and give a new one a new UUID"
+        fault = Problem("path/upload_id", "was used for other files, or another name", hint)
+        raise ApiProblem(409, "upload-exists", "There is an upload of this id, and another request made it.", [fault])
+    if not earlier.committed:
+        service.intake.create(upload_id)  # the server may have died before it came to that
+    return earlier, True
+
+
+def open_upload(service: Service, name: str, files: list[File], upload_id: str | None = None) -> Upload:
     """A new upload of these files, some of them perhaps complete."""
     known = find(service.store, files)
     _require_room(service, [file for file in files if file.name not in known])
     size = sum(file.size for file in files)
-    upload = service.store.add_upload(name, files, service.quotas.upload(service.tenant, size))
+    upload = service.store.add_upload(name, files, service.quotas.upload(service.tenant, size), upload_id)
     try:
         service.intake.create(upload.id)
         _adopt(service, upload.id, files, known)

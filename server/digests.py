@@ -6,7 +6,7 @@ import base64
 import binascii
 import hashlib
 import re
-from typing import Protocol
+from typing import Protocol, Self
 
 TUS_ALGORITHMS = ("sha1", "sha256", "sha512")  # tus asks every server to know sha1
 _CONTENT = {"sha-256": "sha256", "sha-512": "sha512"}
@@ -17,9 +17,11 @@ class BadDigest(Exception):
     """The header cannot be understood; the text says which."""
 
 
-class _Hash(Protocol):
-    def update(self, data: bytes, /) -> None: ...
+class Hash(Protocol):
+    def update(self, data: bytes | memoryview, /) -> None: ...
     def digest(self) -> bytes: ...
+    def hexdigest(self) -> str: ...
+    def copy(self) -> Self: ...
 
 
 class Claim:
@@ -28,7 +30,7 @@ class Claim:
     def __init__(self, header: str, status: int, algorithm: str, expected: bytes) -> None:
         self.header, self.status = header, status
         self._expected = expected
-        self._hash: _Hash = hashlib.new(algorithm)
+        self._hash: Hash = hashlib.new(algorithm)
         if len(expected) != len(self._hash.digest()):
             raise BadDigest(f"the digest in {header} has another length than {algorithm} gives")
 

@@ -1,4 +1,4 @@
-"""Routes for who waits for a job: its state, at once or when it changes, and its events as they come.
+"""Routes for who waits for jobs: the state of one, at once or when it changes; its events as they come; the list.
 
 Nobody who waits here holds a thread; `server.watch` looks for all of them.
 """
@@ -19,7 +19,7 @@ from server.answers import job_out, retry_after
 from server.etags import matches, weak_etag
 from server.schema import JobOut
 from server.service import Served, Service
-from server.watch import Eye
+from server.watch import Eye, Listing, Sight
 from worker.contract import FINISHED
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
@@ -53,7 +53,7 @@ async def get_job(
     return out
 
 
-async def _following(job_id: UUID, service: Served) -> AsyncIterator[Eye]:
+async def _following(job_id: UUID, service: Served) -> AsyncIterator[Eye[Sight]]:
     """An eye on the job as long as the stream lasts; a 404 or 503 before it begins."""
     job = await run_in_threadpool(service.job, job_id)
     with service.watch.on(job.id, service.tenant, events=True) as eye:
@@ -62,14 +62,27 @@ async def _following(job_id: UUID, service: Served) -> AsyncIterator[Eye]:
 
 @router.get("/jobs/{job_id}/events/stream", response_class=EventSourceResponse)
 async def stream_events(
-    eye: Annotated[Eye, Depends(_following)],
+    job_id: UUID,
+    eye: Annotated[Eye[Sight], Depends(_following)],
     service: Served,
     after: Annotated[int, Query(ge=0)] = 0,
     job: Annotated[bool, Query(description="tell, too, whenever the job itself changes: `event: job`")] = False,
     last_event_id: Annotated[int | None, Header(ge=0)] = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """Events numbered above `Last-Event-ID` (or `after`) as they come; `end`, with the job, is the last."""
-    async for event in stream.follow(service, eye, after if last_event_id is None else last_event_id, job):
+    async for event in stream.follow(service, str(job_id), eye, after if last_event_id is None else last_event_id, job):
+        yield event
+
+
+async def _watching(service: Served) -> AsyncIterator[Eye[Listing]]:
+    with service.watch.on_list(service.tenant) as eye:
+        yield eye
+
+
+@router.get("/events", response_class=EventSourceResponse)
+async def stream_jobs(eye: Annotated[Eye[Listing], Depends(_watching)]) -> AsyncIterator[ServerSentEvent]:
+    """The tenant's 50 newest jobs as they change: `event: jobs`, at once and whenever there is news."""
+    async for event in stream.follow_list(eye):
         yield event
 
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import threading
 from collections.abc import Iterator
 from typing import Any
+from uuid import uuid4
 
 from fastapi import APIRouter, Response
 
 from server.announce import MOST_FILES, announced, open_upload
 from server.importing import NotHere, Refused, Source, opened
-from server.intake import Arrival
+from server.intake import Mismatch
+from server.partial import Part
 from server.problems import ApiProblem, invalid, not_found
+from server.receiving import finish
 from server.schema import FileIn, ImportIn, UploadOut
 from server.service import Served, Service
 from server.settings import MIB
@@ -59,11 +63,11 @@ def _copied(service: Service, source: Source, name: str | None) -> str:
     try:
         with service.intake.writing(upload.id) as parts:
             for file in files:
-                arrival = Arrival(parts, file.size, None)
+                part = Part(parts / uuid4().hex, file.size)
                 try:
-                    _settle(service, upload.id, source, file, arrival)
+                    _settle(service, upload.id, source, file, part)
                 finally:
-                    arrival.discard()
+                    part.discard()
     except BaseException:
         service.reserve.deleting(lambda: service.store.drop_upload(upload.id))
         service.intake.remove_upload(upload.id)
@@ -71,19 +75,18 @@ def _copied(service: Service, source: Source, name: str | None) -> str:
     return upload.id
 
 
-def _settle(service: Service, upload_id: str, source: Source, file: File, arrival: Arrival) -> None:
+def _settle(service: Service, upload_id: str, source: Source, file: File, part: Part) -> None:
     with source.file(file.name) as descriptor:
         before = os.fstat(descriptor)
-        while block := os.read(descriptor, MIB):
-            if before.st_size != file.size:
-                break
-            arrival.write(block)
+        with contextlib.suppress(Mismatch):  # it grew, as its size will tell
+            while before.st_size == file.size and (block := os.read(descriptor, MIB)):
+                part.write(block)
         after = os.fstat(descriptor)
     if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns) or before.st_size != file.size:
         fault = Problem(file.name, "changed while it was read", "import it when the scanner has finished")
         raise ApiProblem(409, "changing", "Something still writes to the folder.", [fault])
-    sha256 = arrival.complete()
-    service.intake.settle(upload_id, file.name, arrival, lambda: service.store.received(upload_id, file.name, sha256))
+    part.acknowledge()
+    finish(service, upload_id, file, part)
 
 
 def _announced(source: Source, wanted: list[str]) -> list[File]:

@@ -9,17 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import hashlib
 import os
 import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
-from uuid import uuid4
 
-from server.writeback import Writeback
 from worker.jobfolder import link_or_copy, sync_file, sync_folder
 
 
@@ -33,51 +29,6 @@ class Gone(Exception):
 
 class Mismatch(Exception):
     """The bytes are not the announced ones; the text says how."""
-
-
-class Movable(Protocol):
-    def move_to(self, path: Path) -> None: ...
-
-
-class Arrival:
-    """One file on its way: write it chunk by chunk, then finish, then discard in any case."""
-
-    def __init__(self, parts: Path, size: int, expected_sha256: str | None) -> None:
-        self._path = parts / uuid4().hex
-        self._file = self._path.open("xb")
-        self._size = size
-        self._expected = expected_sha256
-        self._digest = hashlib.sha256()
-        self._writeback = Writeback(self._file.fileno())
-        self._received = 0
-
-    def write(self, chunk: bytes) -> None:
-        self._received += len(chunk)
-        if self._received > self._size:
-            raise Mismatch(f"more than the announced {self._size} bytes arrived")
-        self._digest.update(chunk)
-        self._file.write(chunk)
-        self._writeback.reached(self._received)
-
-    def complete(self) -> str:
-        """Check size and digest and make the bytes durable; returns the sha256."""
-        if self._received != self._size:
-            raise Mismatch(f"{self._received} bytes arrived, {self._size} were announced")
-        sha256 = self._digest.hexdigest()
-        if self._expected is not None and self._expected.lower() != sha256:
-            raise Mismatch("the sha256 of the bytes that arrived is not the announced one")
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        return sha256
-
-    def move_to(self, path: Path) -> None:
-        self._path.replace(path)
-        sync_folder(path.parent)
-
-    def discard(self) -> None:
-        with contextlib.suppress(OSError):  # on a full disk its last bytes cannot be written; nobody wants them
-            self._file.close()
-        self._path.unlink(missing_ok=True)
 
 
 class Intake:
@@ -97,8 +48,9 @@ class Intake:
         return folder if folder.is_dir() else self._scans / upload_id
 
     def create(self, upload_id: str) -> None:
+        """Harmless when that has been done."""
         for name in ("parts", "scan"):
-            (self._uploads / upload_id / name).mkdir(parents=True)
+            (self._uploads / upload_id / name).mkdir(parents=True, exist_ok=True)
         (self._uploads / upload_id / ".lock").touch()
 
     @contextlib.contextmanager
@@ -113,10 +65,10 @@ class Intake:
         with self._locked(upload_id, fcntl.LOCK_EX, wait_s):
             yield
 
-    def settle(self, upload_id: str, name: str, arrival: Movable, record: Callable[[], None]) -> None:
+    def settle(self, upload_id: str, name: str, move_to: Callable[[Path], None], record: Callable[[], None]) -> None:
         """Give a complete file its name and record it, as one step towards other writers of that name."""
         with self._settling:
-            arrival.move_to(self.settled(upload_id, name))
+            move_to(self.settled(upload_id, name))
             record()
 
     def adopt(self, upload_id: str, name: str, scan_id: str, source: str) -> None:

@@ -17,9 +17,9 @@ _OTHER = 16 * KIB  # calls that have no body to speak of
 
 def body_limit(method: str, path: str) -> int | None:
     """Bytes that a body may have. None for files, which are streamed and have the size they announced as limit."""
-    if path.startswith("/v1/uploads/") and method in ("PUT", "PATCH"):
+    if path.startswith("/v1/uploads/") and "/files/" in path and method in ("PUT", "PATCH"):
         return None
-    if path == "/v1/uploads" or (path.startswith("/v1/uploads/") and path.endswith("/files")):
+    if path == "/v1/uploads" or (path.startswith("/v1/uploads/") and (path.endswith("/files") or method == "PUT")):
         return _ANNOUNCEMENT
     if path == "/v1/session":
         return _SESSION

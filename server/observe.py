@@ -76,7 +76,7 @@ class _Request:
         method = self._scope["method"] if self._scope["method"] in _METHODS else "other"
         metrics.requests.labels(method, route, str(status)).inc()
         metrics.seconds.labels(method, _kind(self._scope, route)).observe(seconds)
-        if method in ("PUT", "PATCH") and route.startswith("/v1/uploads/"):
+        if method in ("PUT", "PATCH") and route.startswith("/v1/uploads/{upload_id}/files/"):
             metrics.upload_bytes.inc(self._received)
         fields: dict[str, Any] = {
             "request_id": self.id,

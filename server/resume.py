@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import AsyncIterator
+from functools import partial
+from pathlib import Path as FolderPath
 from typing import Annotated
 from uuid import UUID
 
 from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
 from sqlalchemy.exc import DBAPIError
-from starlette.requests import ClientDisconnect
 
 from server.digests import TUS_ALGORITHMS, BadDigest, Claim, claims, content_digest
-from server.intake import Busy, Gone, Mismatch
-from server.partial import Partial, take_back
-from server.problems import ApiProblem, disk_is_full, invalid, not_found
+from server.intake import Mismatch
+from server.partial import Part, part_path, take_back
+from server.problems import ApiProblem, disk_is_full, invalid
+from server.receiving import End, finish, look, only_writer, receive
 from server.service import Served, Service
 from server.settings import MIB
-from server.spool import Spool
 from server.store import File
 from server.turns import Turn
 from splatcore.errors import Problem
@@ -58,11 +59,11 @@ def _offered() -> Response:
 async def head_file(upload_id: UUID, name: FileName, request: Request, service: Served) -> Response:
     """Where to go on. Ends a PATCH of the same file that is still under way: its client has come back."""
     _require_version(request)
-    async with _opened(service, str(upload_id), name) as (_turn, file, partial):
-        if partial is None:
+    async with _opened(service, str(upload_id), name) as (_turn, file, part):
+        if part is None:
             return Response(headers=_standing(file, file.size, file.sha256))
-        sha256 = await _finished(service, str(upload_id), file, partial)
-        return Response(headers=_standing(file, partial.offset, sha256))
+        sha256 = await _finished(service, str(upload_id), file, part)
+        return Response(headers=_standing(file, part.offset, sha256))
 
 
 @router.patch(
@@ -73,9 +74,9 @@ async def head_file(upload_id: UUID, name: FileName, request: Request, service: 
 async def patch_file(upload_id: UUID, name: FileName, request: Request, service: Served) -> Response:
     _require_version(request)
     start, digests = _start(request), _claims(request)
-    async with _opened(service, str(upload_id), name) as (turn, file, partial):
-        at = file.size if partial is None else partial.offset
-        if partial is None and await to_thread.run_sync(_is_committed, service, str(upload_id)):
+    async with _opened(service, str(upload_id), name) as (turn, file, part):
+        at = file.size if part is None else part.offset
+        if part is None and await to_thread.run_sync(_is_committed, service, str(upload_id)):
             raise ApiProblem(409, "committed", "The upload is committed; its files can no longer change.", headers=TUS)
         if start != at:
             raise ApiProblem(
@@ -88,121 +89,79 @@ async def patch_file(upload_id: UUID, name: FileName, request: Request, service:
         declared = request.headers.get("content-length", "")
         if declared.isdecimal() and at + int(declared) > file.size:
             raise _refused(name, at, f"more than the announced {file.size} bytes would arrive")
-        if partial is None:
+        if part is None:
             return Response(status_code=204, headers=_standing(file, file.size, file.sha256))
-        await _receive(request, turn, name, partial, digests)
-        sha256 = await _finished(service, str(upload_id), file, partial)
-        return Response(status_code=204, headers=_standing(file, partial.offset, sha256))
+        await _receive(request, turn, name, part, digests)
+        sha256 = await _finished(service, str(upload_id), file, part)
+        return Response(status_code=204, headers=_standing(file, part.offset, sha256))
 
 
 @contextlib.asynccontextmanager
-async def _opened(service: Service, upload_id: str, name: str) -> AsyncIterator[tuple[Turn, File, Partial | None]]:
+async def _opened(service: Service, upload_id: str, name: str) -> AsyncIterator[tuple[Turn, File, Part | None]]:
     """This request as the file's only writer; no part if the file is complete."""
-    if await to_thread.run_sync(service.store.upload_file, upload_id, name) is None:
-        raise not_found("file in this upload")  # before the turn, which would end another tenant's request
-    async with service.turns.take(upload_id, name) as turn:
-        found = await to_thread.run_sync(service.store.upload_file, upload_id, name)
-        if found is None:
-            raise not_found("file in this upload")
-        committed, file = found
-        if committed:
+    await look(service, upload_id, name)
+    async with only_writer(service, upload_id, name, TUS) as (turn, file, parts):
+        if parts is None or file.sha256 is not None:
             yield turn, file, None
             return
+
+        def open_part(parts: FolderPath) -> Part:
+            if file.acknowledged == file.size:  # perhaps it got its name just before a crash
+                take_back(parts, name, service.intake.settled(upload_id, name))
+            record = partial(service.store.acknowledge, upload_id, name)
+            return Part(part_path(parts, name), file.size, file.acknowledged, record, service.running)
+
+        part = await to_thread.run_sync(open_part, parts)
         try:
-            with service.intake.writing(upload_id) as parts:
-                if file.sha256 is not None:
-                    yield turn, file, None
-                    return
-
-                def record(offset: int) -> None:
-                    service.store.acknowledge(upload_id, name, offset)
-
-                def open_part() -> Partial:
-                    if file.acknowledged == file.size:  # perhaps it got its name just before a crash
-                        take_back(parts, name, service.intake.settled(upload_id, name))
-                    return Partial(parts, name, file.size, file.acknowledged, record)
-
-                partial = await to_thread.run_sync(open_part)
-                try:
-                    yield turn, file, partial
-                finally:
-                    partial.close()
-        except Busy:
-            raise ApiProblem(409, "busy", "The upload is being committed.", retry_after_s=2, headers=TUS) from None
-        except Gone:
-            raise not_found("upload") from None
+            yield turn, file, part
+        finally:
+            part.close()
 
 
-async def _receive(request: Request, turn: Turn, name: str, partial: Partial, digests: list[Claim]) -> None:
+async def _receive(request: Request, turn: Turn, name: str, part: Part, digests: list[Claim]) -> None:
     """Stream a chunk to disk. What counts at the end is acknowledged; a problem is raised if that is not all."""
-    start, cut = partial.acknowledged, False
+    start = part.acknowledged
 
     def save(block: bytes) -> None:
         for claim in digests:
             claim.update(block)
-        partial.write(block)
-        if not digests and partial.offset - partial.acknowledged >= ACKNOWLEDGE_EVERY:
-            partial.acknowledge()
+        part.write(block)
+        if not digests and part.offset - part.acknowledged >= ACKNOWLEDGE_EVERY:
+            part.acknowledge()
 
     try:
-        async with Spool(save) as spool:
-            with turn.scope:
-                try:
-                    async for piece in request.stream():
-                        await spool.give(piece)
-                except ClientDisconnect:
-                    cut = True
-            taken_over = turn.scope.cancelled_caught
-            if not (digests and (cut or taken_over)):
-                await spool.empty()
+        end = await receive(request, turn, save)
+        broken = next((claim for claim in digests if not claim.holds()), None)
+        if digests and (broken or end is not End.WHOLE):
+            await to_thread.run_sync(part.drop_chunk)
+        else:
+            await to_thread.run_sync(part.acknowledge)
     except Mismatch as mismatch:
-        await to_thread.run_sync(partial.drop_chunk)
-        raise _refused(name, partial.offset, str(mismatch)) from None
-    except (OSError, DBAPIError) as error:
+        await to_thread.run_sync(part.drop_chunk)
+        raise _refused(name, part.offset, str(mismatch)) from None
+    except (OSError, DBAPIError) as error:  # some file systems find room for what was written only when it is synced
         if not is_full(error):
             raise
-        await to_thread.run_sync(partial.drop_chunk)
-        raise _full(partial) from None
-    broken = next((claim for claim in digests if not claim.holds()), None)
-    if digests and (cut or taken_over or broken):
-        await to_thread.run_sync(partial.drop_chunk)
-    else:
-        await _acknowledged(partial)
-    if taken_over:
-        raise _problem(409, "taken-over", "A newer request writes this file now.", partial)
-    if cut:
-        raise _problem(400, "interrupted", "The connection ended before the chunk did.", partial)
+        await to_thread.run_sync(part.drop_chunk)
+        raise disk_is_full(headers=TUS | {"Upload-Offset": str(part.offset)}) from None
+    if end is End.TAKEN_OVER:
+        raise _problem(409, "taken-over", "A newer request writes this file now.", part)
+    if end is End.CUT:
+        raise _problem(400, "interrupted", "The connection ended before the chunk did.", part)
     if broken:
         errors = [Problem(broken.header, "is not the digest of the bytes that arrived", f"send again from {start}")]
-        raise _problem(broken.status, "digest-mismatch", "The chunk was damaged and is dropped.", partial, errors)
+        raise _problem(broken.status, "digest-mismatch", "The chunk was damaged and is dropped.", part, errors)
 
 
-async def _acknowledged(partial: Partial) -> None:
-    try:
-        await to_thread.run_sync(partial.acknowledge)
-    except (OSError, DBAPIError) as error:  # some file systems find room for what was written only now
-        if not is_full(error):
-            raise
-        await to_thread.run_sync(partial.drop_chunk)
-        raise _full(partial) from None
-
-
-async def _finished(service: Service, upload_id: str, file: File, partial: Partial) -> str | None:
+async def _finished(service: Service, upload_id: str, file: File, part: Part) -> str | None:
     """The sha256 of a file whose last byte has come, checked and in its place; None while bytes are missing."""
-    if partial.offset != file.size:
+    if part.offset != file.size:
         return None
-
-    def finish() -> str:
-        sha256 = partial.sha256()
-        if file.expected_sha256 not in (None, sha256):
-            partial.clear()
-            raise _refused(file.name, 0, "the sha256 of the bytes that arrived is not the announced one")
-        service.intake.settle(
-            upload_id, file.name, partial, lambda: service.store.received(upload_id, file.name, sha256)
-        )
-        return sha256
-
-    return await to_thread.run_sync(finish)
+    try:
+        return await to_thread.run_sync(finish, service, upload_id, file, part)
+    except Mismatch as mismatch:
+        await to_thread.run_sync(part.clear)
+        raise _refused(file.name, 0, str(mismatch)) from None
 
 
 def _is_committed(service: Service, upload_id: str) -> bool:
@@ -243,17 +202,13 @@ def _standing(file: File, offset: int, sha256: str | None) -> dict[str, str]:
     return TUS | headers | ({"Repr-Digest": content_digest(sha256)} if sha256 else {})
 
 
-def _full(partial: Partial) -> ApiProblem:
-    return disk_is_full(headers=TUS | {"Upload-Offset": str(partial.offset)})
-
-
 def _refused(name: str, offset: int, what: str) -> ApiProblem:
     refusal = invalid(f"The file was refused: {what}.", [Problem(name, what, f"send again from offset {offset}")])
     refusal.headers |= TUS | {"Upload-Offset": str(offset)}
     return refusal
 
 
-def _problem(status: int, name: str, detail: str, partial: Partial, errors: list[Problem] | None = None) -> ApiProblem:
-    hint = [Problem("Upload-Offset", f"is {partial.offset} now", "ask HEAD, then go on from there")]
-    headers = TUS | {"Upload-Offset": str(partial.offset)}
+def _problem(status: int, name: str, detail: str, part: Part, errors: list[Problem] | None = None) -> ApiProblem:
+    hint = [Problem("Upload-Offset", f"is {part.offset} now", "ask HEAD, then go on from there")]
+    headers = TUS | {"Upload-Offset": str(part.offset)}
     return ApiProblem(status, name, detail, errors or hint, headers=headers)

@@ -198,6 +198,12 @@ class JobList(BaseModel):
     next: str | None = Field(description="give it as `before` for the next page; null on the last")
 
 
+class JobNews(BaseModel):
+    ids: list[str] = Field(description="the newest jobs there are, newest first")
+    jobs: list[JobOut] = Field(description="those of them that the reader was not told of yet, or told otherwise")
+    more: bool = Field(description="there are older ones")
+
+
 class EventList(BaseModel):
     events: list[dict[str, Any]] = Field(description="progress events with number, at, attempt, stage, fraction, …")
     last: int = Field(description="number of the last event given; pass it as `after` next time")

@@ -13,6 +13,7 @@ from server.access import Caller
 from server.census import Outcomes
 from server.importing import Root
 from server.intake import Intake
+from server.partial import Running
 from server.problems import not_found
 from server.quotas import Quotas
 from server.reserve import Reserve
@@ -36,6 +37,7 @@ class Service:
     wake: Callable[[], None]  # have the reconcile loop look at once
     imports: tuple[Root, ...] = ()  # folders that scans may be imported from
     turns: Turns = field(default_factory=Turns)
+    running: Running = field(default_factory=Running)  # digests of files that arrive in pieces
     caller: Caller | None = None  # None: the server itself
 
     def serving(self, caller: Caller) -> Service:

@@ -153,9 +153,13 @@ class Store:
 
     # Uploads
 
-    def add_upload(self, name: str, announced: Sequence[File], permit: Permit = _always) -> Upload:
-        """`permit` may refuse by raising; it sees what there is, and what comes after it cannot change that."""
-        upload_id, now = str(uuid4()), time.time()
+    def add_upload(
+        self, name: str, announced: Sequence[File], permit: Permit = _always, upload_id: str | None = None
+    ) -> Upload:
+        """`permit` may refuse by raising; it sees what there is, and what comes after it cannot change that.
+
+        Raises IntegrityError if there is an upload of that id, whosever it is."""
+        upload_id, now = upload_id or str(uuid4()), time.time()
         with self.database.writing() as write:
             permit(write)
             row = {"id": upload_id, "name": name, "committed": False, "created_at": now, "touched_at": now}

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import threading
-from pathlib import Path as FolderPath
 from typing import Annotated
-from uuid import UUID
+from uuid import UUID, uuid4
 
 from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
-from starlette.requests import ClientDisconnect
 
 from server.adding import file_out
-from server.announce import announced, open_upload, require_scan_json
+from server.announce import announced, open_once, open_upload, require_scan_json
 from server.checking import CheckFailed, check_scan
-from server.intake import Arrival, Busy, Gone, Mismatch
-from server.partial import remove_part
+from server.intake import Busy, Gone, Mismatch
+from server.partial import Part, remove_part
 from server.problems import ApiProblem, invalid, not_found
+from server.receiving import End, finish, look, only_writer, receive
 from server.scans import scan_out
 from server.schema import FileOut, ScanOut, UploadIn, UploadOut, moment
 from server.service import Served, Service
-from server.spool import Spool
 from server.store import File, Scan, Upload
 from splatcore.errors import Problem, ScanError
 
@@ -34,11 +32,18 @@ FileName = Annotated[str, Path(max_length=1024)]
 
 @router.post("", status_code=201)
 def create_upload(body: UploadIn, service: Served, response: Response) -> UploadOut:
-    files = announced(body.files)
-    if not body.growing:
-        require_scan_json(files)
-    upload = open_upload(service, body.name, files)
+    upload = open_upload(service, body.name, _files(body))
     response.headers["Location"] = f"/v1/uploads/{upload.id}"
+    return upload_out(upload)
+
+
+@router.put("/{upload_id}", status_code=201)
+def put_upload(upload_id: UUID, body: UploadIn, service: Served, response: Response) -> UploadOut:
+    """The same under an id of the client's own. Repeated with the same body: the upload; with another: 409."""
+    upload, replayed = open_once(service, str(upload_id), body.name, _files(body))
+    response.headers["Location"] = f"/v1/uploads/{upload.id}"
+    if replayed:
+        response.headers["Idempotency-Replayed"] = "true"
     return upload_out(upload)
 
 
@@ -57,26 +62,30 @@ def get_upload(upload_id: UUID, service: Served) -> UploadOut:
     },
 )
 async def put_file(upload_id: UUID, name: FileName, request: Request, service: Served) -> FileOut:
-    found = await to_thread.run_sync(service.store.upload_file, str(upload_id), name)
-    if found is None:
-        raise not_found("file in this upload")
-    committed, file = found
+    """One whole file, in place of what there is of it. What was cut leaves nothing behind."""
+    committed, file = await look(service, str(upload_id), name)
     if committed:
-        raise ApiProblem(409, "committed", "The upload is committed; its files can no longer change.")
+        raise _committed()
     declared = request.headers.get("content-length", "")
     if declared.isdecimal() and int(declared) != file.size:
         raise invalid(f"{declared} bytes were sent, {file.size} were announced.", [Problem(name, "has another size")])
-    try:
-        with service.intake.writing(str(upload_id)) as parts:
-            sha256 = await _receive(request, service, str(upload_id), file, parts)
-    except Busy:
-        raise ApiProblem(409, "busy", "The upload is being committed.", retry_after_s=2) from None
-    except Gone:
-        raise not_found("upload") from None
-    except Mismatch as mismatch:
-        raise invalid(f"The file was refused: {mismatch}.", [Problem(name, str(mismatch), "send it again")]) from None
-    except ClientDisconnect:
-        raise ApiProblem(400, "interrupted", "The connection ended before the file did.") from None
+    async with only_writer(service, str(upload_id), name) as (turn, file, parts):
+        if parts is None:
+            raise _committed()
+        part = await to_thread.run_sync(Part, parts / uuid4().hex, file.size)
+        try:
+            end = await receive(request, turn, part.write)
+            if end is End.TAKEN_OVER:
+                raise ApiProblem(409, "taken-over", "A newer request writes this file now.")
+            if end is End.CUT:
+                raise ApiProblem(400, "interrupted", "The connection ended before the file did.")
+            sha256 = await to_thread.run_sync(_settled, service, str(upload_id), file, part)
+            await to_thread.run_sync(remove_part, parts, name)  # what came in pieces
+        except Mismatch as fault:
+            problems = [Problem(name, str(fault), "send it again")]
+            raise invalid(f"The file was refused: {fault}.", problems) from None
+        finally:
+            await to_thread.run_sync(part.discard, abandon_on_cancel=False)
     return FileOut(name=name, size=file.size, received=file.size, complete=True, sha256=sha256)
 
 
@@ -141,31 +150,22 @@ def _commit(service: Service, upload: Upload) -> Scan | None:
     return scan
 
 
-async def _receive(request: Request, service: Service, upload_id: str, file: File, parts: FolderPath) -> str:
-    """Stream the body to disk in a thread, hashing on the way; constant memory.
+def _settled(service: Service, upload_id: str, file: File, part: Part) -> str:
+    if part.offset != file.size:
+        raise Mismatch(f"{part.offset} bytes arrived, {file.size} were announced")
+    part.acknowledge()
+    return finish(service, upload_id, file, part)
 
-    A newer request for the same file ends this one, as with pieces: many at once would each take the file's size of
-    the disk, of which it was given once."""
-    async with service.turns.take(upload_id, file.name) as turn:
-        arrival = await to_thread.run_sync(Arrival, parts, file.size, file.expected_sha256)
-        try:
-            async with Spool(arrival.write) as spool:
-                with turn.scope:
-                    async for piece in request.stream():
-                        await spool.give(piece)
-                if turn.scope.cancelled_caught:
-                    raise ApiProblem(409, "taken-over", "A newer request writes this file now.")
-                await spool.empty()
-            sha256 = await to_thread.run_sync(arrival.complete)
 
-            def record() -> None:
-                service.store.received(upload_id, file.name, sha256)
+def _committed() -> ApiProblem:
+    return ApiProblem(409, "committed", "The upload is committed; its files can no longer change.")
 
-            await to_thread.run_sync(service.intake.settle, upload_id, file.name, arrival, record)
-            await to_thread.run_sync(remove_part, parts, file.name)  # the whole file replaces what came in pieces
-            return sha256
-        finally:
-            await to_thread.run_sync(arrival.discard, abandon_on_cancel=False)
+
+def _files(body: UploadIn) -> list[File]:
+    files = announced(body.files)
+    if not body.growing:
+        require_scan_json(files)
+    return files
 
 
 def _upload(service: Service, upload_id: UUID) -> Upload:

@@ -108,6 +108,9 @@ class Ledger:
         self._database = database
         self._tenant = tenant
 
+    def of(self, tenant: str) -> Ledger:
+        return Ledger(self._database, tenant)
+
     def add(
         self,
         write: sa.Connection,

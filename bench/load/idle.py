@@ -26,7 +26,7 @@ from tests.http.stack import commit, scan_files
 
 PAGES = 50
 _START_S = 60.0
-_PAGE_S = 2.0  # between two refreshes, as static/jobs.js and job.js have it
+_PAGE_S = 2.0  # between two refreshes, as static/jobs.js and job.js have it where there is no stream
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def idle(seconds: float, finished: int, say: Callable[[str], None]) -> Measured:
     how = (
         f"{seconds:.0f} s each; {finished} finished jobs kept, two workers; the job at work has news every second. "
         f"Polling: half of the pages ask for the list, half for the job and its news, every {_PAGE_S:g} s, as the "
-        "status page does. Streaming: each follows the job's events."
+        "status page does where it has no stream. Streaming: half follow the list, half the job."
     )
     return Measured("The cost of idling and of being watched", how, figures)
 
@@ -144,7 +144,10 @@ def _look(url: str, job: str, streaming: bool, there: Semaphore) -> None:
 async def _all_pages(url: str, job: str, streaming: bool, there: Semaphore) -> None:
     limits = httpx.Limits(max_connections=PAGES, max_keepalive_connections=PAGES)
     async with httpx.AsyncClient(base_url=url, trust_env=False, timeout=60, limits=limits) as http:
-        pages = [_stream(http, job, there) if streaming else _poll(http, job, number, there) for number in range(PAGES)]
+        pages = [
+            _stream(http, job, number, there) if streaming else _poll(http, job, number, there)
+            for number in range(PAGES)
+        ]
         await asyncio.gather(*pages)
 
 
@@ -163,8 +166,9 @@ async def _poll(http: httpx.AsyncClient, job: str, number: int, there: Semaphore
         await asyncio.sleep(_PAGE_S)
 
 
-async def _stream(http: httpx.AsyncClient, job: str, there: Semaphore) -> None:
-    async with http.stream("GET", f"/v1/jobs/{job}/events/stream") as events:
+async def _stream(http: httpx.AsyncClient, job: str, number: int, there: Semaphore) -> None:
+    url = "/v1/events" if number % 2 else f"/v1/jobs/{job}/events/stream?job=true"
+    async with http.stream("GET", url) as events:
         events.raise_for_status()
         there.release()
         async for _ in events.aiter_lines():

@@ -30,10 +30,18 @@ class Client(Connection):
 
     # Uploads
 
-    def create_upload(self, name: str, files: Sequence[FileSpec], growing: bool = False) -> Upload:
-        """growing: more files are announced later, scan.json among them perhaps."""
+    def create_upload(
+        self, name: str, files: Sequence[FileSpec], growing: bool = False, upload_id: str | None = None
+    ) -> Upload:
+        """growing: more files are announced later, scan.json among them perhaps. upload_id: a UUID of one's own, under
+        which the same may be asked for again, in a later run too, and is one upload."""
         body: dict[str, Any] = {"name": name, "files": [file.to_json() for file in files]}
         body |= {"growing": True} if growing else {}
+        try:  # as in `submit`
+            return Upload.from_json(self._json("PUT", f"/v1/uploads/{_id(upload_id or str(uuid4()))}", json=body))
+        except ServerProblem as problem:
+            if problem.status != 405:
+                raise
         return Upload.from_json(self._json("POST", "/v1/uploads", json=body, repeatable=False))
 
     def announce(self, upload_id: str, files: Sequence[FileSpec]) -> list[UploadedFile]:

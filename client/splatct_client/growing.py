@@ -14,7 +14,7 @@ from splatct_client.errors import InputError, ServerProblem
 from splatct_client.journal import Journal
 from splatct_client.models import FileSpec, Upload
 from splatct_client.scanfolder import ScanFolder, read_scan_folder, spec_of
-from splatct_client.sending import abandon, commit, earlier, given_up_if_refused, send_files
+from splatct_client.sending import abandon, commit, create, earlier, given_up_if_refused, send_files
 
 POLL_S = 0.5
 TIFF = (".tif", ".tiff")
@@ -132,7 +132,4 @@ def _send(client: Client, upload_id: str, spec: FileSpec, source: Path | bytes, 
 
 def _opened(client: Client, name: str, journal: Journal) -> Upload:
     found = earlier(client, journal) if journal.get("growing") else None
-    if found is None:
-        found = client.create_upload(name, [], growing=True)
-        journal.note(upload=found.id, growing=True)
-    return found
+    return found or create(client, journal, name, [], growing=True)

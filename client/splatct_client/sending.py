@@ -12,6 +12,7 @@ import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 from splatct_client.bar import Bar, size_text
@@ -117,9 +118,20 @@ def _opened(client: Client, name: str, specs: Sequence[FileSpec], journal: Journ
             return found
         if found.state != "committed":
             abandon(client, found.id)  # of other files: the scan was changed since
-    upload = client.create_upload(name, specs)
+    return create(client, journal, name, specs, files=files)
+
+
+def create(
+    client: Client, journal: Journal | None, name: str, specs: Sequence[FileSpec], growing: bool = False, **facts: Any
+) -> Upload:
+    """A new upload. Its id is in the journal before the server is asked: whenever this run is killed, the next one
+    finds it."""
+    upload_id = str(uuid4())
     if journal is not None:
-        journal.note(upload=upload.id, files=files)
+        journal.note(upload=upload_id, growing=growing, **facts)
+    upload = client.create_upload(name, specs, growing, upload_id)
+    if journal is not None and upload.id != upload_id:  # of a server too old to take ours
+        journal.note(upload=upload.id)
     return upload
 
 

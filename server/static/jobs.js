@@ -1,10 +1,12 @@
-// The list of jobs, newest first, kept fresh.
+// The list of jobs, newest first, live: the newest come by a stream, older ones when asked for.
 
-import { call, keepFresh, notice } from "./api.js";
+import { call, notice } from "./api.js";
 import { byId, duration, el, finished, moment, place, setText, stateBadge, took } from "./dom.js";
+import { listen } from "./stream.js";
 
-const PAGE = 50;
-let older = []; // what "Show older jobs" has brought; not refreshed
+const PAGE = 50; // as many as the stream tells of
+let jobs = []; // that are shown
+let reached = false; // "Show older jobs" was used: what is pushed out of the newest stays
 
 function progressCell(job) {
   const percent = Math.round(job.progress * 100);
@@ -36,7 +38,7 @@ function row(job) {
 }
 
 // Rows are replaced only where something changed, so that focus and selection survive.
-function show(jobs) {
+function show() {
   const body = byId("rows");
   const before = new Map([...body.children].map((node) => [node.dataset.id, node]));
   const focused = document.activeElement?.closest?.("tr")?.dataset.id;
@@ -54,43 +56,59 @@ function show(jobs) {
   byId("empty").hidden = jobs.length > 0;
 }
 
-function count(jobs, more) {
+function count(more) {
   const active = { running: 0, queued: 0 };
   for (const job of jobs) if (job.state in active) active[job.state] += 1;
   const parts = [`${active.running} running`, `${active.queued} waiting`, `${jobs.length}${more ? " newest" : ""} listed`];
   setText(byId("counts"), jobs.length ? parts.join(" · ") : "");
 }
 
+// `newest`: jobs from the newest on, without a gap. What is not among them and no older was deleted.
+function take(newest, more) {
+  const oldest = Date.parse(newest.at(-1)?.created_at ?? 0);
+  const rest = jobs.filter((job) => Date.parse(job.created_at) < oldest && newest.every(({ id }) => id !== job.id));
+  jobs = [...newest, ...(reached ? rest : [])];
+  if (!reached) byId("older").hidden = !more;
+  show();
+  count(!byId("older").hidden);
+}
+
+function hear({ ids, jobs: changed, more }) {
+  const known = new Map([...jobs, ...changed].map((job) => [job.id, job]));
+  take(ids.map((id) => known.get(id)), more);
+}
+
+// Where there is no stream.
 async function refresh() {
   const page = await call(`/v1/jobs?limit=${PAGE}`);
-  const known = new Set(page.jobs.map((job) => job.id));
-  const jobs = [...page.jobs, ...older.filter((job) => !known.has(job.id))];
-  if (older.length === 0) byId("older").hidden = page.next === null;
-  show(jobs);
-  await lookForWorkers(jobs);
-  count(jobs, !byId("older").hidden);
+  take(page.jobs, page.next !== null);
   return jobs.some((job) => !finished(job)) ? 2000 : 5000;
 }
 
-// When a job waits and none runs, say why, if the server knows.
-async function lookForWorkers(jobs) {
+// When a job waits and none runs, say why, if the server knows. No news comes of a job that goes on waiting.
+async function lookForWorkers() {
   const waits = jobs.some((job) => job.state === "queued" && Date.now() - Date.parse(job.created_at) > 15000);
-  if (!waits || jobs.some((job) => job.state === "running")) return notice("");
+  notice(waits && !jobs.some((job) => job.state === "running") ? await obstacle() : "");
+}
+
+async function obstacle() {
   const ready = await (await fetch("/readyz")).json();
-  if (!ready.database) return notice("The server cannot write to its database.");
-  if (!ready.redis) return notice("The queue does not answer: jobs are safe in the database and wait for Redis.");
-  if (!ready.workers) return notice("No worker is alive, so jobs wait. Start one with: splatct worker");
-  return notice("");
+  if (!ready.database) return "The server cannot write to its database.";
+  if (!ready.redis) return "The queue does not answer: jobs are safe in the database and wait for Redis.";
+  if (!ready.workers) return "No worker is alive, so jobs wait. Start one with: splatct worker";
+  return "";
 }
 
 async function showOlder() {
-  const last = byId("rows").lastElementChild?.dataset.id;
+  const last = jobs.at(-1);
   if (!last) return;
   try {
-    const page = await call(`/v1/jobs?limit=${PAGE}&before=${encodeURIComponent(last)}`);
-    older = [...older, ...page.jobs];
-    byId("rows").append(...page.jobs.map(row));
+    const page = await call(`/v1/jobs?limit=${PAGE}&before=${encodeURIComponent(last.id)}`);
+    reached = true;
+    jobs = [...jobs, ...page.jobs.filter((job) => jobs.every(({ id }) => id !== job.id))];
     byId("older").hidden = page.next === null;
+    show();
+    count(!byId("older").hidden);
   } catch (error) {
     notice(error.message);
   }
@@ -110,4 +128,5 @@ async function copy() {
 setText(byId("command"), `splatct submit SCAN_FOLDER --server ${location.origin} -o RESULTS`);
 byId("older").addEventListener("click", showOlder);
 byId("copy").addEventListener("click", copy);
-keepFresh(refresh, (error) => notice(error.message));
+listen(() => "/v1/events", { jobs: hear }, refresh, (error) => notice(error.message));
+setInterval(() => document.hidden || lookForWorkers().catch(() => {}), 2000); // the stream tells if the server is away

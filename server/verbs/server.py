@@ -27,6 +27,7 @@ def run(args: argparse.Namespace) -> int:
 
     from server import logs
     from server.app import create_app
+    from server.heap import share_one_heap
     from server.opening import make_ready
     from server.settings import Settings
     from server.wire import uvicorn_config
@@ -34,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.tie_to is not None:
         die_with_parent(args.tie_to, signal.SIGTERM)
+    share_one_heap()
     given = {name: getattr(args, name) for name in ("data", "host", "port")}
     settings = Settings.read(given)
     os.umask(0o077)

@@ -44,7 +44,7 @@ class FakeApi:
     results: dict[str, bytes] = field(default_factory=dict)
     states: list[str] = field(default_factory=lambda: ["queued", "running", "succeeded"])
     error: dict[str, str] | None = None
-    takes_ids: bool = True  # PUT /v1/jobs/{uuid}
+    takes_ids: bool = True  # PUT /v1/jobs/{uuid}, /v1/uploads/{uuid}
     commit_answer: Answer | None = None
     faults: list[tuple[str, Answer | BaseException]] = field(default_factory=list)
     cut_download_at: list[int] = field(default_factory=list)
@@ -82,7 +82,10 @@ class FakeApi:
                 {"name": "calibrate", "choices": ["full", "static", "none"], "low": None, "high": None},
                 {"name": "splats", "choices": None, "low": 100, "high": 5000000},
             ]})  # fmt: skip
-        if (method, path) == ("POST", "/uploads"):
+        makes = method == "PUT" and path.startswith("/uploads/") and path.count("/") == 2
+        if makes and not self.takes_ids:
+            return problem(405, "Method not allowed")
+        if makes or (method, path) == ("POST", "/uploads"):
             self.announced = json.loads(body)
             return ok({"id": "up-1", "name": self.announced["name"], "state": "open", "files": []}, 201)
         if method == "PUT" and path.startswith("/uploads/up-1/files/"):

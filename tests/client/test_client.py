@@ -46,26 +46,26 @@ def test_a_name_with_odd_characters_arrives_as_it_is(client, api):
 
 @pytest.mark.parametrize("status", [429, 500, 502, 503, 504])
 def test_an_overloaded_server_is_asked_again(client, api, sleeps, status):
-    api.faults = [("PUT", (status, {}, b"")), ("PUT", (status, {}, b""))]
+    api.faults = [("PUT /v1/uploads/up-1/files", (status, {}, b""))] * 2
     upload_one(client, b"data")
     assert api.uploads["a.tif"] == b"data"
     assert len(sleeps) == 2 and sleeps[1] > sleeps[0]
 
 
 def test_retry_after_is_honoured(client, api, sleeps):
-    api.faults = [("PUT", (429, {"Retry-After": "7"}, b""))]
+    api.faults = [("PUT /v1/uploads/up-1/files", (429, {"Retry-After": "7"}, b""))]
     upload_one(client, b"data")
     assert sleeps == [7.0]
 
 
 def test_a_lost_connection_is_retried_with_the_whole_file(client, api):
-    api.faults = [("PUT", httpx.ReadError("reset"))]
+    api.faults = [("PUT /v1/uploads/up-1/files", httpx.ReadError("reset"))]
     upload_one(client, b"data" * 1000)
     assert api.uploads["a.tif"] == b"data" * 1000
 
 
 def test_patience_ends(client, api, sleeps):
-    api.faults = [("PUT", (503, {}, b""))] * 100
+    api.faults = [("PUT /v1/uploads/up-1/files", (503, {}, b""))] * 100
     with pytest.raises(ServerProblem, match="503") as caught:
         upload_one(client, b"data")
     assert caught.value.exit_code == 1
@@ -80,6 +80,26 @@ def test_a_submission_is_repeated_under_the_same_id(client, api):
     assert len(puts) == 3 and len(set(puts)) == 1 and len(api.submitted) == 1
     client.submit("scan-1")
     assert api.calls[-1] not in puts, "another submission, another id"
+
+
+def test_an_upload_is_asked_for_again_under_the_same_id(client, api):
+    client.options()
+    api.faults = [("PUT /v1/uploads", httpx.ReadTimeout("slow")), ("PUT /v1/uploads", (500, {}, b""))]
+    client.create_upload("scan", [FileSpec("a.tif", 1)])
+    puts = [call for call in api.calls if call.startswith("PUT")]
+    assert len(puts) == 3 and len(set(puts)) == 1
+    client.create_upload("scan", [FileSpec("a.tif", 1)])
+    assert api.calls[-1] not in puts, "another upload, another id"
+
+
+def test_an_older_server_is_never_asked_for_an_upload_twice(client, api):
+    client.options()
+    api.takes_ids = False
+    assert client.create_upload("scan", [FileSpec("a.tif", 1)]).id == "up-1"
+    api.faults = [("POST /v1/uploads", httpx.ReadTimeout("slow"))]
+    with pytest.raises(ServerUnreachable):
+        client.create_upload("scan", [FileSpec("a.tif", 1)])
+    assert api.calls.count("POST /v1/uploads") == 2
 
 
 def test_an_older_server_is_never_sent_a_job_twice(client, api):
@@ -101,7 +121,7 @@ def test_a_server_that_never_answered_is_reported_at_once(client, api, sleeps):
 
 def test_bytes_changed_on_the_way_are_noticed(client, api):
     wrong = b'{"name": "a.tif", "size": 4, "sha256": "00"}'
-    api.faults = [("PUT", (200, {}, wrong))]
+    api.faults = [("PUT /v1/uploads/up-1/files", (200, {}, wrong))]
     with pytest.raises(IntegrityError, match=r"a\.tif"):
         upload_one(client, b"data")
 

@@ -299,7 +299,7 @@ BOX = '{"shape": [2, 2, 2], "voxel_mm": [0.1, 0.1, 0.1]}'
 
 
 def test_pointers_are_fit_for_a_terminal(tmp_path: Path) -> None:
-    text = problems(write_scan(tmp_path, changes={"/\x1b[31mred\ud800": 1, "/" + "k" * 500: 2}))
+    text = problems(write_scan(tmp_path, changes={"/\x1b[31mred": 1, "/" + "k" * 500: 2}))
     assert text.isascii() or "…" in text
     assert "\x1b" not in text and "\\x1b[31mred" in text and "k" * 100 not in text
 
@@ -463,6 +463,9 @@ def test_all_problems_are_listed_at_once(tmp_path: Path) -> None:
         (b'{"simulation": ' + b'{"a":' * 80 + b"1" + b"}" * 80 + b"}", "deep"),
         (b'{"name": ' + b"9" * 10_000 + b"}", "not usable JSON"),
         (b'{"name": 1e999}', "/name"),
+        (b'{"name": "\\ud800"}', "is not JSON"),
+        (b'{"name": "\xef\xbb\xbf', "is not JSON"),
+        (b"\xef\xbb\xbf[1]", "expected one object"),
     ],
 )
 def test_text_that_is_not_a_scan(tmp_path: Path, text: bytes, words: str) -> None:

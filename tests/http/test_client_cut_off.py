@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import random
 import re
+import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -45,8 +48,9 @@ class Scanner:
         tifffile.imwrite(path.with_suffix(".part"), pixels, photometric="minisblack")
         return path.with_suffix(".part").rename(path)
 
-    def start(self, *arguments: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "splatct_client", *arguments, "--server", str(self.stack.http.base_url)]
+    def start(self, *arguments: str, server: str = "") -> subprocess.Popen[str]:
+        server = server or str(self.stack.http.base_url)
+        command = [sys.executable, "-m", "splatct_client", *arguments, "--server", server]
         environment = {name: value for name, value in os.environ.items() if not name.startswith("SPLATCT_")}
         environment |= {"PYTHONPATH": PYTHONPATH, "XDG_STATE_HOME": str(self.state)}
         return subprocess.Popen(
@@ -153,6 +157,59 @@ def _told(scanner: Scanner) -> bytes:
     from splatct_client.scanfolder import read_scan_folder
 
     return json.dumps([spec.to_json() for spec in read_scan_folder(scanner.folder).specs], sort_keys=True).encode()
+
+
+class Wire:
+    """Between client and server; the first answer to a request that begins with `mark` is withheld."""
+
+    def __init__(self, port: int, mark: bytes) -> None:
+        self._port, self._mark, self.withheld = port, mark, threading.Event()
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._listening.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def close(self) -> None:
+        self._listening.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):  # it was closed
+            while True:
+                client, _ = self._listening.accept()
+                threading.Thread(target=self._carry, args=(client,), daemon=True).start()
+
+    def _carry(self, client: socket.socket) -> None:
+        """One request after the other, as a client sends them."""
+        with client, socket.create_connection(("127.0.0.1", self._port)) as server, contextlib.suppress(OSError):
+            hold = False
+            while ready := select.select([client, server], [], [])[0]:
+                for end in ready:
+                    data = end.recv(1 << 16)
+                    if not data:
+                        return
+                    hold = hold or (end is client and data.startswith(self._mark) and not self.withheld.is_set())
+                    if end is server and hold:
+                        self.withheld.set()
+                        return
+                    (server if end is client else client).sendall(data)
+
+
+@pytest.mark.parametrize("command", ["submit", "send"])
+def test_a_client_that_died_before_it_heard_of_its_upload_leaves_none_behind(scanner: Scanner, command: str) -> None:
+    scanner.write("p.tif", np.ones((12, 16, 16), "float32"))
+    scanner.describe(["p.tif"], 12, 16)
+    settle = ["--settle", "0.1"] if command == "send" else []
+    wire = Wire(scanner.stack.port, b"PUT /v1/uploads/")
+    process = scanner.start(command, str(scanner.folder), *settle, server=wire.url)
+    assert wire.withheld.wait(60), "the server has made the upload"
+    process.kill()
+    process.communicate()
+    (left,) = scanner.uploads()
+    again = scanner.start(command, str(scanner.folder), *settle, "--json", server=wire.url)
+    out, err = again.communicate(timeout=60)
+    wire.close()
+    assert again.returncode == 0, err
+    assert json.loads(out)["job"]["scan_id"] == left.name, "the upload of the run that died was gone on with"
+    assert scanner.uploads() == []
 
 
 def test_a_scan_that_changed_is_sent_anew(scanner: Scanner) -> None:

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 from server.intake import Intake
 from server.janitor import Janitor
 from server.migrations import prepare
-from server.partial import Partial
+from server.partial import Part, part_path
 from server.reserve import Reserve
 from server.retention import Rules, freed
 from server.store import File, NewJob, Scan, Store
@@ -80,7 +80,7 @@ def test_the_received_part_of_a_file_is_no_longer_reserved_and_goes_with_its_upl
     assert store.outstanding_bytes() == 1010
 
     with intake.writing(upload.id) as parts:
-        part = Partial(parts, "a.tif", 1000, 0, lambda offset: store.acknowledge(upload.id, "a.tif", offset))
+        part = Part(part_path(parts, "a.tif"), 1000, 0, lambda offset: store.acknowledge(upload.id, "a.tif", offset))
         part.write(bytes(600))
         assert store.outstanding_bytes() == 1010  # not yet durable
         part.acknowledge()

@@ -109,7 +109,7 @@ UNKNOWN = [
 def test_unknown_ids_cover_every_route(http: httpx.Client) -> None:
     paths = http.get("/openapi.json").json()["paths"]
     with_id = {(method.upper(), path) for path, methods in paths.items() for method in methods if "{" in path}
-    makes_one = {("PUT", "/v1/jobs/{job_id}")}
+    makes_one = {("PUT", "/v1/jobs/{job_id}"), ("PUT", "/v1/uploads/{upload_id}")}
     file = "/v1/uploads/{upload_id}/files/{name}"
     elsewhere = {(method, file) for method in ("HEAD", "PATCH", "OPTIONS")}  # test_resume.py: no JSON, other headers
     elsewhere |= {("POST", "/v1/uploads/{upload_id}/files")}  # test_growing.py: needs a body

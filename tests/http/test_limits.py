@@ -79,6 +79,7 @@ def test_a_subscriber_is_one_however_many_addresses_it_has() -> None:
         ("PUT", f"/v1/jobs/{NOBODY_S}", 256 << 10),
         ("POST", f"/v1/jobs/{NOBODY_S}/cancel", 256 << 10),
         ("POST", "/v1/uploads", 16 << 20),
+        ("PUT", f"/v1/uploads/{NOBODY_S}", 16 << 20),
         ("POST", f"/v1/uploads/{NOBODY_S}/commit", 16 << 10),
         ("DELETE", f"/v1/scans/{NOBODY_S}", 16 << 10),
         ("POST", "/healthz", 16 << 10),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
 import socket
 import time
@@ -13,9 +15,14 @@ from typing import Any
 
 import httpx
 import pytest
+import sqlalchemy as sa
 
+from server.migrations import prepare
 from server.tail import KEPT, Tail
+from server.watch import Watch
+from worker.database import Database
 from worker.journal import Cursor, EventWriter
+from worker.ledger import Ledger
 
 from .stack import Stack, commit, scan_files, submit
 
@@ -179,3 +186,88 @@ def test_a_cursor_takes_whole_lines_only_and_goes_on_where_it_stopped(tmp_path: 
         file.write(b": 3}\n")
     assert [(line.number, line.text) for line in cursor.read(10)] == [(3, '{"a": 3}')]
     assert [line.number for line in Cursor(journal).read(10, after=2)] == [3]
+
+
+def news(answer: httpx.Response) -> Iterator[dict[str, Any]]:
+    """What `jobs` tells, again and again."""
+    for line in answer.iter_lines():
+        if line.startswith("data: "):
+            yield json.loads(line.removeprefix("data: "))
+
+
+def test_the_list_is_told_whole_and_then_what_changed(stack: Stack) -> None:
+    """No worker runs here."""
+    scan_id = commit(stack.http, scan_files())
+    with stack.http.stream("GET", "/v1/events") as answer:
+        assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/event-stream")
+        told = news(answer)
+        assert next(told) == {"ids": [], "jobs": [], "more": False}
+        first = submit(stack.http, scan_id)
+        assert [job["id"] for job in next(told)["jobs"]] == [first]
+        second = submit(stack.http, scan_id)
+        after = next(told)
+        assert after["ids"] == [second, first] and [job["id"] for job in after["jobs"]] == [second]
+        stack.http.post(f"/v1/jobs/{first}/cancel").raise_for_status()
+        moved = {job["id"]: (job["state"], job["queue_position"]) for job in next(told)["jobs"]}
+        assert moved == {first: ("cancelled", None), second: ("queued", 1)}
+        stack.http.delete(f"/v1/jobs/{first}").raise_for_status()
+        assert next(told) == {"ids": [second], "jobs": [], "more": False}
+
+
+def test_the_list_is_the_newest_fifty_and_says_that_there_are_more(stack: Stack) -> None:
+    scan_id = commit(stack.http, scan_files())
+    jobs = [submit(stack.http, scan_id) for _ in range(51)]
+    with stack.http.stream("GET", "/v1/events") as answer:
+        first = next(news(answer))
+    assert first["ids"] == jobs[:0:-1] and first["more"]
+    listed = stack.http.get("/v1/jobs").json()["jobs"]
+    assert [job["id"] for job in first["jobs"]] == first["ids"]
+    assert first["jobs"] == listed
+
+
+def test_each_tenant_s_list_is_its_own(stack: Stack) -> None:
+    """What another tenant does is no news: not its jobs, and no silence broken by them."""
+    keys = [stack.new_key(tenant, "admin")[1] for tenant in ("a", "b")]
+    with stack.client(keys[0]) as a, stack.client(keys[1]) as b:
+        mine = submit(a, commit(a, scan_files()))
+        theirs = commit(b, scan_files())
+        with a.stream("GET", "/v1/events") as of_a, b.stream("GET", "/v1/events") as of_b:
+            told_a, told_b = news(of_a), news(of_b)
+            assert next(told_a)["ids"] == [mine] and next(told_b)["ids"] == []
+            other = submit(b, theirs)
+            assert next(told_b)["ids"] == [other]
+            time.sleep(1.5)
+            a.post(f"/v1/jobs/{mine}/cancel").raise_for_status()
+            after = next(told_a)
+            assert after["ids"] == [mine] and [job["state"] for job in after["jobs"]] == ["cancelled"]
+
+
+def test_a_list_that_nobody_watches_costs_nothing_and_one_that_many_watch_is_looked_at_once(tmp_path: Path) -> None:
+    database = Database(f"sqlite:///{tmp_path / 'db'}")
+    prepare(database)
+    asked: list[str] = []
+
+    @sa.event.listens_for(database.engine, "before_cursor_execute")
+    def note(_connection: Any, _cursor: Any, statement: str, *_: Any) -> None:
+        if statement.startswith("SELECT"):
+            asked.append(statement)
+
+    async def run() -> None:
+        watch = Watch(Ledger(database), tmp_path)
+        looking = asyncio.create_task(watch.keep_looking())
+        await asyncio.sleep(1.2)
+        assert asked == []
+        with contextlib.ExitStack() as eyes:
+            watching = [eyes.enter_context(watch.on_list("a")) for _ in range(20)]
+            for eye in watching:
+                assert await eye.news(5) is not None
+            begun = len(asked)
+            await asyncio.sleep(2.2)
+            assert begun <= 2 and 3 <= len(asked) - begun <= 6
+        left = len(asked)
+        await asyncio.sleep(1.2)
+        assert len(asked) - left <= 1
+        looking.cancel()
+
+    asyncio.run(run())
+    database.close()

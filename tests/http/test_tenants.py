@@ -19,7 +19,7 @@ from .stack import Stack, announce, commit, scan_files, submit
 
 NO_IDS = {  # nothing in the request names a thing; what they list is tested below
     "GET /", "GET /healthz", "GET /readyz", "GET /metrics", "GET /openapi.json", "HEAD /openapi.json",
-    "GET /v1/options", "GET /v1/jobs", "GET /v1/scans", "POST /v1/uploads", "OPTIONS /v1/uploads",
+    "GET /v1/options", "GET /v1/jobs", "GET /v1/events", "GET /v1/scans", "POST /v1/uploads", "OPTIONS /v1/uploads",
     "GET /sign-in", "GET /v1/usage", "GET /v1/webhooks", "POST /v1/webhooks",
     "POST /v1/session", "GET /v1/session", "DELETE /v1/session",
     "GET /jobs/{job_id}",  # a shell that is the same for every id
@@ -28,6 +28,7 @@ NO_IDS = {  # nothing in the request names a thing; what they list is tested bel
 
 FOREIGN = [
     "GET /v1/uploads/{upload_id}",
+    "PUT /v1/uploads/{upload_id}",
     "PUT /v1/uploads/{upload_id}/files/{name}",
     "PATCH /v1/uploads/{upload_id}/files/{name}",
     "HEAD /v1/uploads/{upload_id}/files/{name}",
@@ -59,6 +60,7 @@ FOREIGN = [
     "GET /v1/webhooks/{webhook_id}/deliveries",
     "DELETE /v1/webhooks/{webhook_id}",
 ]
+MAKES_ONE = ("PUT /v1/jobs/{job_id}", "PUT /v1/uploads/{upload_id}")  # under an id that nobody has
 IN_BODY = {
     "POST /v1/jobs", "POST /v1/jobs/validate",
     "POST /v1/imports",  # names a folder of the tenant's: see test_importing.py
@@ -86,7 +88,9 @@ class Two:
         method, path = call.split()
         url = path.format(**ids, name="scan.json", file="volume.tif", axis="z", index=0)
         more: dict[str, Any] = {}
-        if method == "PUT" and "uploads" in path:
+        if call == "PUT /v1/uploads/{upload_id}":
+            more["json"] = {"name": "x", "files": [{"name": "scan.json", "size": 1}]}
+        elif method == "PUT" and "uploads" in path:
             more["content"] = b"x"
         if method == "PATCH" and "jobs" in path:
             more["json"] = {"priority": "high"}
@@ -130,7 +134,7 @@ def test_no_route_is_left_out() -> None:
 def test_a_foreign_id_is_not_there(two: Two, call: str) -> None:
     foreign = two.ask(two.second, call, two.ids)
     assert foreign.status_code == 404, foreign.text
-    if call != "PUT /v1/jobs/{job_id}":  # where an id that nobody has makes a job
+    if call not in MAKES_ONE:
         nobody = two.ask(two.second, call, dict.fromkeys(two.ids, str(uuid4())))
         assert (nobody.status_code, nobody.content) == (404, foreign.content), "no word betrays that there is one"
     if call.startswith("GET"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -229,3 +230,55 @@ def test_commits_at_the_same_time_give_one_scan(http: httpx.Client, shared: Stac
     assert len({answer.text for answer in answers}) == 1
     listed = [scan["id"] for scan in http.get("/v1/scans").json()["scans"]]
     assert listed.count(upload_id) == 1
+
+
+def test_an_upload_under_an_id_of_the_client_s_own_is_made_once(stack: Stack) -> None:
+    http, url = stack.http, f"/v1/uploads/{uuid4()}"
+    body = {"name": "x", "files": [{"name": "scan.json", "size": 3}, {"name": "a.tif", "size": 5, "sha256": "A" * 64}]}
+    made = http.put(url, json=body)
+    assert (made.status_code, made.headers["location"], made.json()["state"]) == (201, url, "open")
+    assert "idempotency-replayed" not in made.headers
+    http.put(f"{url}/files/scan.json", content=b"abc").raise_for_status()
+    http.post(f"{url}/files", json={"files": [{"name": "more.tif", "size": 1}]}).raise_for_status()
+    again = http.put(url, json=body)
+    assert (again.status_code, again.headers["idempotency-replayed"]) == (201, "true")
+    assert [file["received"] for file in again.json()["files"]] == [3, 0, 0], "as it is now"
+    for other in (body | {"name": "y"}, body | {"files": body["files"][::-1]}, body | {"files": body["files"] * 2}):
+        refused = http.put(url, json=other)
+        assert refused.status_code in (409, 422) and http.get(url).json() == again.json()
+    assert http.put(url, json=body | {"name": "y"}).json()["type"] == "urn:splatct:problem:upload-exists"
+    assert http.get("/v1/usage").json()["open_uploads"]["used"] == 1
+    assert http.put("/v1/uploads/nonsense", json=body).status_code == 422
+    http.delete(url).raise_for_status()
+    assert "idempotency-replayed" not in http.put(url, json=body).headers, "what was given up can begin anew"
+
+
+def test_many_requests_at_once_make_one_upload(stack: Stack) -> None:
+    url, body = f"/v1/uploads/{uuid4()}", {"name": "x", "files": [{"name": "scan.json", "size": 3}]}
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(lambda _: stack.http.put(url, json=body), range(16)))
+    assert {answer.status_code for answer in answers} == {201}
+    assert sum("idempotency-replayed" not in answer.headers for answer in answers) == 1
+    assert len(list((stack.data / "uploads").iterdir())) == 1
+    stack.http.put(f"{url}/files/scan.json", content=b"abc").raise_for_status()
+
+
+def test_a_server_that_died_before_it_made_the_folder_makes_it_when_asked_again(stack: Stack) -> None:
+    upload_id, body = str(uuid4()), {"name": "x", "files": [{"name": "scan.json", "size": 3}]}
+    stack.http.put(f"/v1/uploads/{upload_id}", json=body).raise_for_status()
+    shutil.rmtree(stack.data / "uploads" / upload_id)
+    stack.http.put(f"/v1/uploads/{upload_id}", json=body).raise_for_status()
+    stack.http.put(f"/v1/uploads/{upload_id}/files/scan.json", content=b"abc").raise_for_status()
+
+
+def test_a_committed_upload_asked_for_again_is_the_committed_one(stack: Stack) -> None:
+    files = scan_files()
+    body = {"name": "x", "files": [{"name": name, "size": len(data)} for name, data in files.items()]}
+    upload_id = str(uuid4())
+    stack.http.put(f"/v1/uploads/{upload_id}", json=body).raise_for_status()
+    for name, data in files.items():
+        stack.http.put(f"/v1/uploads/{upload_id}/files/{name}", content=data).raise_for_status()
+    stack.http.post(f"/v1/uploads/{upload_id}/commit").raise_for_status()
+    again = stack.http.put(f"/v1/uploads/{upload_id}", json=body).raise_for_status().json()
+    assert (again["state"], again["scan_id"]) == ("committed", upload_id)
+    assert not list((stack.data / "uploads").iterdir())
