@@ -37,6 +37,7 @@ from server.deliveries import Outbox, keep_delivering
 from server.dispatch import Dispatcher
 from server.guard import Guard
 from server.health import Pulse
+from server.heap import keep_giving_back
 from server.importing import roots
 from server.intake import Intake
 from server.janitor import Janitor, keep_clean
@@ -109,6 +110,7 @@ def create_app(settings: Settings) -> FastAPI:
             asyncio.create_task(keep_reconciling(reconciler, settings.reconcile_s, wake)),
             asyncio.create_task(watch.keep_looking()),
             asyncio.create_task(keep_clean(Janitor(store, intake, settings.data, Rules.of(settings), reserve))),
+            asyncio.create_task(keep_giving_back()),
             asyncio.create_task(keep_delivering(outbox, settings.webhook_networks)),
         ]
         try:

@@ -1,10 +1,12 @@
-"""Keeps the C library from growing a heap for each thread."""
+"""Keeps the C library from holding on to memory that Python has freed."""
 
 from __future__ import annotations
 
+import asyncio
 import ctypes
 
 _M_ARENA_MAX = -8  # malloc.h
+_EVERY_S = 30.0
 
 
 def share_one_heap() -> None:
@@ -14,3 +16,12 @@ def share_one_heap() -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, 1)
+
+
+async def keep_giving_back() -> None:
+    """Give the system the whole pages of what is free, holes among what is in use included, which glibc otherwise
+    keeps. A few milliseconds each time."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    while trim is not None:
+        await asyncio.sleep(_EVERY_S)
+        await asyncio.to_thread(trim, 0)
