@@ -63,7 +63,7 @@ def _range(volume: Any) -> tuple[float, float]:
 
 
 def _png(plane: np.ndarray[Any, np.dtype[np.float32]], low: float, high: float) -> bytes:
-    scaled = (plane - low) * (255.0 / max(high - low, 1e-30))
+    scaled = (plane.astype(np.float64) - low) * (255.0 / max(high - low, 1e-30))  # low and high are anybody's
     grey = np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8)
     out = io.BytesIO()
     Image.fromarray(grey).save(out, "PNG", compress_level=3)

@@ -84,6 +84,13 @@ def _unreadable(said: str) -> tuple[str, str]:
         return f"gives the key {shown(twice[1])} twice in one object, again at {twice[2]}", "keep one of them"
     if said.startswith("number out of range"):  # thousands of digits
         return f"is not usable JSON: {said}", ""
+    if "hex escape" in said or "surrogate" in said:
+        return (
+            f"is not JSON: {said}",
+            "characters beyond \\uffff are written as two escapes, \\ud83e\\udeb7 and the like",
+        )
+    if said.startswith("EOF while parsing"):
+        return f"is not JSON: {said}", "it is empty or cut off; write it again"
     return f"is not JSON: {said}", ""
 
 
@@ -130,6 +137,9 @@ class Document:
                     self.note(name, what, f"write them as \\u… or keep the file below {_MAX_NOT_ASCII} bytes")
                     return None
                 raw.decode()
+            if b"\0" in raw:
+                self.note(name, "is not text: it holds bytes of zero", "save it as UTF-8; UTF-16 has them, too")
+                return None
         except UnicodeDecodeError as error:
             self.note(name, f"is not UTF-8 text (byte {error.start})", "save it as UTF-8")
             return None
@@ -168,7 +178,11 @@ class Document:
                     self.pass_over()
                     return
                 pointer = "".join(f"/{token(step)}" for step in [*path, str(key)])
-                self.note(pointer, f"got {value}, expected a finite number", "JSON knows neither NaN nor Infinity")
+                self.note(
+                    pointer,
+                    f"got {value}, expected a finite number",
+                    "JSON knows neither NaN nor Infinity, and a float nothing above 1.8e308",
+                )
             elif isinstance(value, dict | list) and not _plain(value):
                 if len(stack) > _MAX_DEPTH:
                     self.note(name, f"is nested deeper than {_MAX_DEPTH} levels")

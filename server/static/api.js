@@ -42,8 +42,8 @@ async function problem(response) {
   return Object.assign(new Error(text), { status: response.status });
 }
 
-export function setConnection(there) {
-  setText(byId("connection"), there ? "" : "The server does not answer; trying again");
+export function setConnection(there, why = "The server does not answer") {
+  setText(byId("connection"), there ? "" : `${why.replace(/\.$/, "")}; trying again`);
 }
 
 // Runs `refresh` again and again; it returns the pause in ms, or null to stop. A hidden page rests.
@@ -60,12 +60,13 @@ export function keepFresh(refresh, onRefused) {
       failures = 0;
       setConnection(true);
     } catch (error) {
-      if (error.status && error.status < 500) {
+      const busy = error.status === 429;
+      if (error.status && error.status < 500 && !busy) {
         onRefused(error);
         return;
       }
       failures += 1;
-      setConnection(false);
+      setConnection(false, busy ? error.message : undefined);
       pause = Math.min(2000 * failures, 15000);
     }
     if (pause !== null) setTimeout(turn, pause);

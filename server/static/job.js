@@ -119,7 +119,9 @@ function showDraft() {
   const draft = live.draft;
   if (draft === draftShown) return;
   draftShown = draft;
-  showSlices(id, draft.draft.voxel_mm, draft.number).catch(() => setText(byId("slices-heading"), "Volume so far, not shown"));
+  showSlices(id, draft.draft.voxel_mm, draft.number).catch(() => {
+    if (draftShown === draft && !endShown) setText(byId("slices-heading"), "Volume so far, not shown");
+  });
 }
 
 // What only a job that has ended has: results, whole or partial, and another run.

@@ -4,6 +4,7 @@ import { call, notice } from "./api.js";
 import { byId, duration, el, finished, moment, place, setText, stateBadge, took } from "./dom.js";
 import { listen } from "./stream.js";
 
+const MOST = 500; // jobs that one request may ask for
 const PAGE = 50; // as many as the stream tells of
 let jobs = []; // that are shown
 let reached = false; // "Show older jobs" was used: what is pushed out of the newest stays
@@ -63,9 +64,12 @@ function count(more) {
   setText(byId("counts"), jobs.length ? parts.join(" · ") : "");
 }
 
-// `newest`: jobs from the newest on, without a gap. What is not among them and no older was deleted.
+// `newest`: jobs from the newest on, without a gap. What is not among them and no older was deleted. If none of those
+// shown before is the oldest of them, jobs may be missing in between: older ones are to be asked for again.
 function take(newest, more) {
-  const oldest = Date.parse(newest.at(-1)?.created_at ?? 0);
+  const last = newest.at(-1);
+  if (last && more && !jobs.some(({ id }) => id === last.id)) reached = false;
+  const oldest = Date.parse(last?.created_at ?? 0);
   const rest = jobs.filter((job) => Date.parse(job.created_at) < oldest && newest.every(({ id }) => id !== job.id));
   jobs = [...newest, ...(reached ? rest : [])];
   if (!reached) byId("older").hidden = !more;
@@ -86,9 +90,24 @@ async function refresh() {
 }
 
 // When a job waits and none runs, say why, if the server knows. No news comes of a job that goes on waiting.
+let told = "";
+
 async function lookForWorkers() {
   const waits = jobs.some((job) => job.state === "queued" && Date.now() - Date.parse(job.created_at) > 15000);
-  notice(waits && !jobs.some((job) => job.state === "running") ? await obstacle() : "");
+  const now = waits && !jobs.some((job) => job.state === "running") ? await obstacle() : "";
+  if (now !== told) notice(now); // and leave other notices alone
+  told = now;
+}
+
+// No stream tells of jobs that are not among the newest.
+async function lookAtOlder() {
+  if (!reached || jobs.length <= PAGE) return;
+  const count = Math.min(jobs.length - PAGE, MOST);
+  const page = await call(`/v1/jobs?limit=${count}&before=${encodeURIComponent(jobs[PAGE - 1].id)}`);
+  jobs = [...jobs.slice(0, PAGE), ...page.jobs, ...jobs.slice(PAGE + count)];
+  show();
+  if (page.jobs.length === count) return;
+  byId("older").hidden = page.next === null;
 }
 
 async function obstacle() {
@@ -129,4 +148,5 @@ setText(byId("command"), `splatct submit SCAN_FOLDER --server ${location.origin}
 byId("older").addEventListener("click", showOlder);
 byId("copy").addEventListener("click", copy);
 listen(() => "/v1/events", { jobs: hear }, refresh, (error) => notice(error.message));
+setInterval(() => document.hidden || lookAtOlder().catch(() => {}), 10000);
 setInterval(() => document.hidden || lookForWorkers().catch(() => {}), 2000); // the stream tells if the server is away

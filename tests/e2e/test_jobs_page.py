@@ -68,6 +68,61 @@ def test_what_newer_jobs_push_out_stays_where_older_ones_are_shown(page: Page, s
     assert names == ["new", *(f"job {number}" for number in range(55) if number != 3)]
 
 
+HIDE = """state => { Object.defineProperty(document, 'hidden', {get: () => state, configurable: true});
+document.dispatchEvent(new Event('visibilitychange')); }"""
+
+
+def test_older_jobs_are_asked_for_again_where_some_may_be_missing(page: Page, stage: Stage) -> None:
+    now = time.time()
+    for number in range(60):
+        stage.job(f"job {number}", State.CANCELLED, created_at=now - 100 - number)
+    page.goto("/")
+    rows = page.locator("#rows tr")
+    expect(rows).to_have_count(50)
+    page.get_by_role("button", name="Show older jobs").click()
+    expect(rows).to_have_count(60)
+    page.evaluate(HIDE, True)
+    for number in range(55):  # more than the page hears of at once
+        stage.job(f"new {number}", State.CANCELLED, created_at=now - number)
+    page.evaluate(HIDE, False)
+    expect(rows.first).to_contain_text("new 0")
+    expect(rows).to_have_count(50)
+    for count in (100, 115):
+        page.get_by_role("button", name="Show older jobs").click()
+        expect(rows).to_have_count(count)
+    expect(page.get_by_role("button", name="Show older jobs")).to_be_hidden()
+
+
+def test_older_jobs_are_looked_at_now_and_then(browser: Browser, stage: Stage) -> None:
+    now = time.time()
+    for number in range(50):
+        stage.job(f"job {number}", State.CANCELLED, created_at=now - number)
+    waits, gone = stage.job("waits", created_at=now - 100), stage.job("gone", State.CANCELLED, created_at=now - 101)
+    page = browser.new_page(base_url=stage.url)  # its console complains that a job waits and no worker is there
+    page.goto("/")
+    page.get_by_role("button", name="Show older jobs").click()
+    rows = page.locator("#rows tr")
+    expect(rows).to_have_count(52)
+    expect(rows.nth(50)).to_contain_text("queued")
+    assert stage.ledger.ask_cancel(waits) and stage.ledger.forget(gone)
+    expect(rows.nth(50)).to_contain_text("cancelled", timeout=15_000)
+    expect(rows).to_have_count(51)
+    page.close()
+
+
+def test_asking_too_often_is_not_the_end(browser: Browser, stage: Stage) -> None:
+    page = browser.new_page(base_url=stage.url)  # its console may complain
+    refusal = '{"title": "Too many requests", "detail": "Too many requests."}'
+    for path in ("**/v1/events", "**/v1/jobs?*"):
+        page.route(path, lambda route: route.fulfill(status=429, content_type="application/json", body=refusal))
+    page.goto("/")
+    expect(page.locator("#connection")).to_have_text("Too many requests; trying again")
+    page.unroute("**/v1/jobs?*")
+    expect(page.get_by_role("heading", name="No jobs yet")).to_be_visible(timeout=10_000)
+    expect(page.locator("#connection")).to_be_empty()
+    page.close()
+
+
 def test_after_a_restart_of_the_server_it_goes_on(browser: Browser, stage: Stage) -> None:
     stage.job("before")
     page = browser.new_page(base_url=stage.url)  # its console may complain
@@ -101,13 +156,11 @@ def test_a_hidden_page_holds_no_connection(page: Page, stage: Stage) -> None:
     page.on("request", lambda request: opened.append(urlsplit(request.url).path))
     page.goto("/")
     expect(page.get_by_role("heading", name="No jobs yet")).to_be_visible()
-    hide = "state => { Object.defineProperty(document, 'hidden', {get: () => state, configurable: true}); "
-    hide += "document.dispatchEvent(new Event('visibilitychange')); }"
-    page.evaluate(hide, True)
+    page.evaluate(HIDE, True)
     stage.job("unseen")
     page.wait_for_timeout(1500)
     expect(page.locator("#rows tr")).to_have_count(0)
-    page.evaluate(hide, False)
+    page.evaluate(HIDE, False)
     expect(page.locator("#rows tr")).to_have_count(1)
     assert opened.count("/v1/events") == 2
 

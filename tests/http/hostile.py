@@ -87,6 +87,13 @@ def with_value(pointer: str, text: str) -> Files:
     return with_json(json.dumps(scan).replace('"@@"', text))
 
 
+def frames_of(text: str) -> Files:
+    """A scan whose views have frames of their own, and these."""
+    scan = json.loads(json.dumps(SCAN))
+    scan["geometry"] = {key: scan["geometry"][key] for key in ("beam", "detector")} | {"frames": "@@"}
+    return with_json(json.dumps(scan).replace('"@@"', f"[{text}]"))
+
+
 def detector(rows: int, cols: int, views: int = VIEWS) -> Callable[[dict[str, Any]], None]:
     def change(scan: dict[str, Any]) -> None:
         scan["geometry"]["detector"] |= {"rows": rows, "cols": cols, "pixel_mm": [1e-3, 1e-3]}
@@ -194,7 +201,7 @@ REFUSED: dict[str, tuple[Callable[[], Files], tuple[str, ...]]] = {
     "a stream of a file": (lambda: names("projections.tif:hidden"), ("not a plain relative path",)),
     "a name with NUL": (lambda: names("projections.tif\0.png"), ("not a plain relative path",)),
     "a name that turns around": (lambda: names("proj\u202eections.tif"), ("not a plain relative path",)),
-    "half a character": (lambda: names("\ud800.tif"), ("not a plain relative path",)),
+    "half a character": (lambda: names("\ud800.tif"), ("two escapes",)),
     "the folder itself": (lambda: names("."), ("not a regular file",)),
     "scan.json as pixels": (lambda: names("scan.json"), ("is not a TIFF",)),
     "one file twice": (lambda: names("projections.tif", "./projections.tif"), ("same file",)),
@@ -220,6 +227,7 @@ REFUSED: dict[str, tuple[Callable[[], Files], tuple[str, ...]]] = {
     "two million wrong numbers": (
         lambda: with_value("/geometry/angles_deg", "[" + "1e300," * 2_000_000 + "1]"), ("/geometry/angles_deg/0",),
     ),
+    "two million frames that are none": (lambda: frames_of("1," * 2_000_000 + "1"), ("/geometry/frames/0",)),
     "two million times NaN": (lambda: with_value("/name", "[" + "NaN," * 2_000_000 + "1]"), ("finite",)),
     "ten million brackets": (lambda: with_value("/name", "[" + "[]," * 5_000_000 + "1]"), ("more than the",)),
     "a key of 40 MB": (lambda: with_json('{"' + "k" * 40_000_000 + '": 1}'), ("unknown",)),
@@ -227,7 +235,10 @@ REFUSED: dict[str, tuple[Callable[[], Files], tuple[str, ...]]] = {
     "40 MB and one rare character": (lambda: with_value("/name", '"' + "n" * 40_000_000 + '\U0001f480"'), ("ASCII",)),
     "a scan.json of 100 MB": (lambda: with_json(b" " * 100_000_000), ("100000000 bytes",)),
     "UTF-16": (lambda: with_json(json.dumps(SCAN).encode("utf-16")), ("not UTF-8",)),
-    "no JSON": (lambda: with_json("\0" * 1000), ("not JSON",)),
+    "UTF-16 without a mark": (lambda: with_json(json.dumps(SCAN).encode("utf-16-le")), ("bytes of zero",)),
+    "nothing but NUL": (lambda: with_json("\0" * 1000), ("not text",)),
+    "no JSON": (lambda: with_json("splat"), ("not JSON",)),
+    "cut off": (lambda: with_json(json.dumps(SCAN)[:-9]), ("cut off",)),
     "no object": (lambda: with_json("[1]"), ("expected one object",)),
 }  # fmt: skip
 
