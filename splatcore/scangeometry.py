@@ -6,11 +6,10 @@ import math
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatcore import geometry
 from splatcore.document import Document
-from splatcore.geometry import Array, Frames
+from splatcore.geometry import Frames
 from splatcore.grid import VolumeGrid
 from splatcore.tiff import MAX_SIDE
 
@@ -94,7 +93,7 @@ def read_frames(given: Any, at: str, beam: geometry.Beam, detector: tuple[int, i
         doc.note(at, "is empty", "give one frame for each view")
         return None
     keys = ("source" if beam == "cone" else "ray", "detector_center", "u", "v")
-    table: Array = np.empty((len(items), 4, 3))
+    table = np.empty((len(items), 4, 3))
     for i, item in enumerate(items):
         if doc.full:
             return None
@@ -107,7 +106,7 @@ def read_frames(given: Any, at: str, beam: geometry.Beam, detector: tuple[int, i
             )
             if vector is not None:
                 table[i, j] = vector
-    whole: NDArray[np.bool_] = np.isfinite(table).all(axis=(1, 2))
+    whole = np.asarray(np.isfinite(table).all(axis=(1, 2)))
     first, center, u, v = np.moveaxis(table, 1, 0)
     along = center - first if beam == "cone" else first
     normal = np.cross(u, v)
