@@ -134,7 +134,9 @@ def test_interruptions_again_and_again(scan: Scan, whole: tuple[list[bytes], int
     assert bits(after_stops(scan, WHOLE, tmp_path / "run.checkpoint", [step, 1, step, step, 7, step, step])) == whole[0]
 
 
-@pytest.mark.parametrize("method", ["static", pytest.param("r2", marks=pytest.mark.slow), "paper"])
+@pytest.mark.parametrize(
+    "method", [pytest.param("static", marks=pytest.mark.slow), pytest.param("r2", marks=pytest.mark.slow), "paper"]
+)
 def test_other_ways_to_reconstruct(scan: Scan, method: str, tmp_path: Path) -> None:
     options, counter = METHODS[method], StopAt(None, 0)
     expected = bits(drain(reconstruct(scan, options, counter)))

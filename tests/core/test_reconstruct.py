@@ -106,6 +106,7 @@ def test_all_static_errors_of_a_scan_that_turns_the_other_way(tmp_path):
     assert poses["static"]["rotation_reversed"] is True and poses["static_sigma"]["roll_deg"] == sigma["roll_deg"]
 
 
+@pytest.mark.slow
 def test_same_bits_again_and_at_any_number_of_threads(tmp_path):
     scan = scan_of(tmp_path, Simulation(views=20, det=64, sigma_rot=0.02, sigma_trans=0.5), edge=32)
     runs = [drain(reconstruct(scan, Options(quality="preview", threads=threads))) for threads in (1, 2, 2)]
@@ -211,6 +212,7 @@ def test_a_bad_pixel_mask_is_obeyed(tmp_path):
     assert np.abs(masked.volume - truth.volume).mean() < 0.5 * np.abs(plain.volume - truth.volume).mean()
 
 
+@pytest.mark.slow
 def test_parallel_beam(tmp_path):
     scan = scan_of(tmp_path, Simulation(views=30, det=64), edge=32)
     nominal = circular("parallel", np.arange(30) * 12.0, 0, 0, 64, 64, (4.5, 4.5))

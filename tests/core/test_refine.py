@@ -65,12 +65,14 @@ def sharp_result(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scan, Recons
             return scan, end.value, events
 
 
+@pytest.mark.slow
 def test_a_sharp_object_is_given_variation(sharp_result):
     evidence = weighing(sharp_result[1])
     assert evidence["weight"] > 0 and evidence["held_out_views"] == 4
     assert evidence[f"residual_at_{evidence['weight']:g}"] < evidence["residual_at_0"]
 
 
+@pytest.mark.slow
 def test_a_weight_that_does_harm_is_refused(sharp_result, monkeypatch):
     monkeypatch.setattr("splatcore.refine.WEIGHTS", (0.0, 5.0, 10.0))
     evidence = weighing(drain(reconstruct(sharp_result[0], FIXED)))
@@ -134,6 +136,7 @@ def test_a_preview_does_without(tmp_path):
     assert not [finding for finding in result.report["findings"] if finding["name"] == "smoothness of the volume"]
 
 
+@pytest.mark.slow
 def test_too_few_views_to_hold_any_out_get_some(tmp_path):
     simulate(sharp(), tmp_path, replace(NOISY, views=12), threads=1, name="few")
     evidence = weighing(drain(reconstruct(read_scan(tmp_path), FIXED)))

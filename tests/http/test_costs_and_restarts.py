@@ -51,6 +51,7 @@ def test_priority_is_kept_and_orders_the_queue(shared: Stack, scan_id: str) -> N
     assert shared.http.post("/v1/jobs", json={"scan_id": scan_id, "priority": "mine"}).status_code == 422
 
 
+@pytest.mark.slow
 def test_a_restart_goes_on_from_where_a_cancelled_job_was(shared: Stack) -> None:
     job_id = submit(shared.http, commit(shared.http, scan_files(steps=60, pause=0.05)), seed=3)
     shared.until(lambda: shared.job(job_id)["progress"] > 0.3, what="some progress")

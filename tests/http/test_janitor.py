@@ -201,6 +201,7 @@ def test_bytes_are_those_that_come_free(tmp_path: Path) -> None:
     assert freed([tmp_path / "a", tmp_path / "b", tmp_path / "c"]) == 1010
 
 
+@pytest.mark.slow
 def test_pins_and_the_command(stack: Stack) -> None:
     stack.start_worker()
     first, second = (commit(stack.http, scan_files()) for _ in range(2))

@@ -77,6 +77,7 @@ def test_a_wait_ends_with_a_change_and_a_finished_job_is_not_waited_for(idle: St
     assert again.status_code == 304 and time.monotonic() - began < 2
 
 
+@pytest.mark.slow
 def test_a_hundred_who_wait_occupy_no_thread(idle: Stack) -> None:
     """The pool has 40 threads; with 100 requests asleep in it nothing else would be answered."""
     job_id = queued(idle)

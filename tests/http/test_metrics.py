@@ -36,6 +36,7 @@ def value(samples: Samples, name: str, **labels: str) -> float:
     return samples.get((name, tuple(sorted(labels.items()))), 0.0)
 
 
+@pytest.mark.slow
 def test_jobs_their_ends_and_the_queue(stack: Stack) -> None:
     scan_id = commit(stack.http, scan_files())
     ids = [submit(stack.http, scan_id) for _ in range(3)]

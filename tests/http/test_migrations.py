@@ -282,6 +282,7 @@ def test_a_server_killed_at_any_moment_of_an_upgrade_upgrades_when_it_is_started
     assert ("copying", False) in reached, reached
 
 
+@pytest.mark.slow
 def test_servers_that_start_together_on_an_old_schema_all_serve(tmp_path: Path) -> None:
     grown(f"sqlite:///{tmp_path / 'splatct.db'}")
     ports = [_free_port() for _ in range(3)]

@@ -141,6 +141,7 @@ def test_a_download_of_what_is_deleted_ends_whole(stack: Stack) -> None:
 # Many at once
 
 
+@pytest.mark.slow
 def test_of_several_workers_one_runs_a_job_that_the_queue_names_many_times(stack: Stack) -> None:
     for _ in range(4):
         stack.start_worker()

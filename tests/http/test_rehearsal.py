@@ -52,6 +52,7 @@ def test_a_crash_of_the_first_attempt_alone_costs_an_attempt(start: Callable[...
     assert (job["state"], job["attempt"]) == ("succeeded", 2)
 
 
+@pytest.mark.slow
 def test_a_hanging_engine_can_be_cancelled(start: Callable[..., Stack]) -> None:
     stack = start(end="hang", at_step="2", step_s="0.1")
     job_id = submit(stack.http, commit(stack.http, scan_files(steps=5)))

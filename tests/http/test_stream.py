@@ -242,6 +242,7 @@ def test_each_tenant_s_list_is_its_own(stack: Stack) -> None:
             assert after["ids"] == [mine] and [job["state"] for job in after["jobs"]] == ["cancelled"]
 
 
+@pytest.mark.slow
 def test_a_list_that_nobody_watches_costs_nothing_and_one_that_many_watch_is_looked_at_once(tmp_path: Path) -> None:
     database = Database(f"sqlite:///{tmp_path / 'db'}")
     prepare(database)

@@ -136,6 +136,7 @@ def test_it_is_told_again_until_it_is_taken_under_one_id(told: Stack, receiver: 
         verify(hook["secret"], headers, body)
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_with_the_server(told: Stack, receiver: Receiver) -> None:
     """A job ends while no server runs; the worker alone writes the outbox."""
     add(told, receiver.url)

@@ -177,6 +177,7 @@ def test_an_engine_that_something_else_kills_is_not_given_up_so_soon(run: Run, n
         assert (job.state, job.attempt, job.crashes) == (State.QUEUED, attempt, attempt - 1)
 
 
+@pytest.mark.slow
 def test_an_engine_that_gets_further_each_time_is_not_given_up(
     settings: WorkerSettings, ledger: Ledger, new_job: NewJob
 ) -> None:
