@@ -20,7 +20,7 @@ def share_one_heap() -> None:
 
 async def keep_giving_back() -> None:
     """Give the system the whole pages of what is free, holes among what is in use included, which glibc otherwise
-    keeps. A few milliseconds each time."""
+    keeps."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     while trim is not None:
         await asyncio.sleep(_EVERY_S)

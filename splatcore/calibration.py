@@ -17,7 +17,7 @@ from splatcore.gate import Decision, gate, information
 from splatcore.gauge import settle
 from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.jitter import narrowed
-from splatcore.lowpass import low_passed
+from splatcore.lowpass import HUBER, NORMAL, low_passed
 from splatcore.options import Options
 from splatcore.planar import unseen
 from splatcore.poses import Normals, Prior, accumulate, step_full
@@ -43,8 +43,6 @@ _CAUTION = 1000.0
 _LOPSIDED = 0.2  # share of the detector's half by which the axis may be off its middle
 STATIC_FIRST = 3  # sweeps of the coarsest level that move no single view
 _REACH_PX = 1.5  # longest pose step, in pixels of the level
-_NORMAL = 1.2533  # standard deviation over mean absolute deviation, of normal noise
-_HUBER = 2.0  # standard deviations of the residual beyond which a pixel counts less for the poses
 
 # The prior where the scanner states no tolerance: degrees, and a share of the volume's half width.
 _LOOSE_ROTATION_DEG, _LOOSE_TRANSLATION = 5.0, 0.1
@@ -159,12 +157,12 @@ class Calibration:
             normals = self.accumulate(here, descent)
             self._deviation = _deviation(normals)
             return normals, 1.0
-        self._deviation = _NORMAL * soft.rough
-        huber = max(_HUBER * _NORMAL * soft.smooth, 1e-12 * float(np.abs(here.images).max()))
+        self._deviation = NORMAL * soft.rough
+        huber = max(HUBER * NORMAL * soft.smooth, 1e-12 * float(np.abs(here.images).max()))
         return self._accumulate(soft.here, soft.renderer, descent.splats, huber), soft.shared
 
     def _huber(self, here: Level) -> float:
-        return _HUBER * self._deviation or float(np.abs(here.images).max())
+        return HUBER * self._deviation or float(np.abs(here.images).max())
 
     def gate(self, here: Level) -> str | None:
         """Before the finest level: how freely views may move from here on, in a sentence; None if nothing is asked."""
@@ -267,7 +265,7 @@ class Calibration:
 
 def _deviation(normals: Normals) -> float:
     """Standard deviation of the residual, outliers hardly counted. Line integral."""
-    return _NORMAL * float(normals.residual_abs.sum() / max(normals.pixels.sum(), 1.0))
+    return NORMAL * float(normals.residual_abs.sum() / max(normals.pixels.sum(), 1.0))
 
 
 def _prior(scan: Scan, half: float) -> Prior:

@@ -21,13 +21,14 @@ from splatcore.pyramid import Level, means_of_blocks
 from splatcore.splats import Floats, Splats
 from splatcore.uncertainty import extent
 
+NORMAL = 1.2533  # standard deviation over mean absolute deviation, of normal noise
+HUBER = 2.0  # standard deviations of the residual beyond which a pixel counts less for the poses
 _TAILS = 3.0  # standard deviations at which the filter's kernel ends
 _BINNING = 2
 _SPLATS = 1.5  # largest width of the filter, in sizes of the median splat
 _SHARED = 0.25  # and in wavelengths of the finest detail that views share: it passes half at three quarters of that
 _TILE = 16  # binned pixels along a side, of the pieces of a view that may each be blurred by an amount of their own
 _BLUR = 0.03  # expected size of these amounts, where nothing is seen of them; half a squared binned pixel
-_NORMAL, _HUBER = 1.2533, 2.0  # as in splatcore.calibration
 _LEAST = 1.0  # pixels; a filter that would be narrower is left out
 
 
@@ -95,8 +96,8 @@ def _width(splats: Splats, views: int) -> float:
 def _without_blur(residual: Floats, drawn: Floats, weights: Floats) -> Floats:
     """The residual less what it would be to blur or to sharpen `drawn` along rows and along columns, by an amount of
     its own in every tile: the least squares of both, outliers hardly counted. All [rows, cols]."""
-    deviation = _NORMAL * float((np.abs(residual) * weights).mean()) / max(float(weights.mean()), 1e-6)
-    weights = weights * np.minimum(1, _HUBER * deviation / np.maximum(np.abs(residual), 1e-20))
+    deviation = NORMAL * float((np.abs(residual) * weights).mean()) / max(float(weights.mean()), 1e-6)
+    weights = weights * np.minimum(1, HUBER * deviation / np.maximum(np.abs(residual), 1e-20))
     curved = [_curvature(drawn, axis) for axis in (0, 1)]
     starts = [np.arange(0, n, _TILE) for n in residual.shape]
 
