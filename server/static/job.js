@@ -9,7 +9,7 @@ import { showLogOf } from "./joblog.js";
 import { Live } from "./live.js";
 import { showPoses } from "./poses.js";
 import { showReport } from "./report.js";
-import { showSlices } from "./slices.js";
+import { hideSlices, showSlices } from "./slices.js";
 
 const id = byId("job").dataset.id;
 const url = `/v1/jobs/${encodeURIComponent(id)}`;
@@ -129,7 +129,7 @@ async function showEnd(job) {
   if (!finished(job) || endShown) return;
   endShown = true;
   const kind = job.state === "succeeded" ? "results" : job.links?.partial ? "partial" : null;
-  if (kind === null) byId("slices").hidden = true; // what was shown is no longer there
+  if (kind === null) hideSlices();
   await actions.known;
   const parts = [kind ? showResults(kind) : null, actions.may("submit") ? offerAgain(url, job) : null];
   const failed = (await Promise.allSettled(parts)).filter((part) => part.status === "rejected");

@@ -41,6 +41,14 @@ export async function showSlices(jobId, voxel = [1, 1, 1], draft = null) {
   panes.forEach((pane) => pane.refresh());
 }
 
+// What was shown is no longer there, and what is still being fetched is not to appear.
+export function hideSlices() {
+  turn += 1;
+  panes = [];
+  byId("views").replaceChildren();
+  byId("slices").hidden = true;
+}
+
 // `share`: of the way through the volume.
 function makePane(address, { axis, name, across, up }, count, share, shape) {
   const picture = el("img", { class: "slice", alt: "" });
