@@ -95,7 +95,7 @@ class Calibration:
     @property
     def fixed(self) -> bool:
         """Whether the geometry is left as it is."""
-        return self._options.calibrate == "none" or (self._still and not self._separable)
+        return self._options.calibrate == "none" or (self._still and (not self._separable or self.static == Static()))
 
     @property
     def _still(self) -> bool:
@@ -183,6 +183,8 @@ class Calibration:
         if self.decision.model == "full":
             self.prior = narrowed(self.prior, self.motions, information(self.normals))
         _, self.motions = settle(scanner, self.decision.motions)
+        if self._still and self.static.negligible:
+            self.static = Static()
         return self.decision.sentence()
 
     def sweep(self, here: Level, descent: Descent, finest: int) -> dict[str, float]:

@@ -125,10 +125,10 @@ class _Run:
         self._scan, self._options, self._orientation, self._keeper = scan, options, orientation, keeper
         assert options.threads is not None
         self._threads = options.threads
-        self._rng = np.random.default_rng(options.seed)
         self._clock, self._schedule = Clock(), Schedule(scan, options)
         self._calibration = Calibration(scan, options)
         self._stage = 0  # number of the present one
+        self._rng = self._draws()
         self._here: Level | None = None  # what it works at, as the scan has it
         self._descent: Descent | None = None  # of the finest level so far
         self._under_way: dict[str, Any] = {}  # of the present level: step, views left in this epoch, loss
@@ -165,6 +165,10 @@ class _Run:
                 self._descent = Descent.from_state(self._earlier[0]["descent"])
             self._weighing = Weighing(start=self._descent, **state["weighed"])
 
+    def _draws(self) -> np.random.Generator:
+        """Of each stage its own, so that what came before it decides nothing but where it begins."""
+        return np.random.default_rng([self._options.seed, self._stage])
+
     def progress(self, stage: str, message: str, **facts: object) -> Progress:
         return Progress(stage, self._fraction, message, self._clock.seconds, **facts)  # type: ignore[arg-type]
 
@@ -178,6 +182,7 @@ class _Run:
             with self._clock.timed(f"binning_{stage.factor}" if stage.kind == "level" else stage.kind):
                 yield from parts[stage.kind](stage, self._here)
             self._stage, self._under_way, self._book = self._stage + 1, {}, None
+            self._rng = self._draws()
             self._keeper.pause(self.state, stage_ends=True)
             if stage.kind == "level" and self._stage < len(self._schedule.stages):
                 yield from self._show(self._here)

@@ -145,3 +145,16 @@ def test_too_few_views_are_not_judged():
     decision = gate(here, motions, nothing, PRIOR)
     assert decision.model == "full" and decision.motions is motions
     assert "No view could be left out" in decision.sentence()
+
+
+@pytest.mark.slow
+def test_freedom_costs_nothing_where_the_geometry_is_right(tmp_path):
+    """Once the gate has found that nothing moves and no constant error shows, the run is that with fixed poses."""
+    scan = scan_of(tmp_path, Simulation(views=40, det=80, noise="none", seed=11))
+    free, fixed = (
+        drain(reconstruct(scan, Options(splats=6000, threads=1, calibrate=calibrate))) for calibrate in ("full", "none")
+    )
+    assert free.report["findings"] != fixed.report["findings"]  # it was asked for
+    np.testing.assert_array_equal(free.splats.means, fixed.splats.means)
+    np.testing.assert_array_equal(free.volume, fixed.volume)
+    assert free.static == fixed.static
