@@ -1,4 +1,4 @@
-"""Writes small scan folders for tests. No part of it reads scans."""
+"""Writes small scan folders for tests, and tells what bad ones are blamed for."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import tifffile
+
+from splatcore.errors import ScanError
+from splatcore.scan import check_scan, read_scan
 
 ROWS, COLS, VIEWS = 12, 16, 9
 
@@ -63,3 +67,13 @@ def write_scan(
 
 def write_tiff(path: Path, images: np.ndarray, **options: Any) -> None:
     tifffile.imwrite(path, images, photometric="minisblack", **options)
+
+
+def problems(folder: Path) -> str:
+    """Everything a bad scan is blamed for; reading and checking must agree on it."""
+    with pytest.raises(ScanError) as checked:
+        check_scan(folder)
+    with pytest.raises(ScanError) as read:
+        read_scan(folder)
+    assert str(read.value) == str(checked.value)
+    return str(checked.value)
