@@ -18,7 +18,7 @@ def job_out(service: Service, job: Job) -> JobOut:
 
 def jobs_out(service: Service, jobs: Sequence[Job]) -> list[JobOut]:
     """Many, with one look at the queue."""
-    queue = service.store.jobs.positions() if any(job.state is State.QUEUED for job in jobs) else {}
+    queue = service.store.jobs.positions(jobs)
     return [JobOut.of(job, queue.get(job.id)) for job in jobs]
 
 

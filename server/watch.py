@@ -15,7 +15,6 @@ from typing import Generic, TypeVar
 from server.problems import ApiProblem
 from server.schema import JobOut
 from server.tail import Tail
-from worker.contract import State
 from worker.jobfolder import JobFolder
 from worker.journal import Line
 from worker.ledger import Job, Ledger
@@ -182,7 +181,7 @@ class Watch:
     def _look(self, tails: dict[str, Tail | None]) -> dict[str, tuple[Sight, list[Line]]]:
         """The rows before the journals: when a row says that the job has finished, all its events are there."""
         jobs = {job.id: job for job in self._ledger.many(list(tails))} if tails else {}
-        queue = self._ledger.positions() if any(job.state is State.QUEUED for job in jobs.values()) else {}
+        queue = self._ledger.positions(jobs.values())
         return {
             job_id: (Sight(jobs.get(job_id), queue.get(job_id)), [] if tail is None else tail.fetch())
             for job_id, tail in tails.items()
@@ -193,7 +192,7 @@ class Watch:
         for tenant in tenants:
             ledger = self._ledger.of(tenant)
             jobs = ledger.page(None, LISTED + 1, None)
-            queue = ledger.positions() if any(job.state is State.QUEUED for job in jobs) else {}
+            queue = ledger.positions(jobs)
             shown = {job.id: JobOut.of(job, queue.get(job.id)) for job in jobs[:LISTED]}
             found[tenant] = Listing(shown, len(jobs) > LISTED)
         return found

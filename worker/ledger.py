@@ -154,12 +154,18 @@ class Ledger:
         """Those of `ids` that there are."""
         return self._read(sa.select(jobs).where(jobs.c.id.in_(ids)))
 
-    def positions(self) -> dict[str, int]:
-        """The place of every queued job among its tenant's, 1 for the one that is next: how many others wait is
+    def positions(self, among: Iterable[Job]) -> dict[str, int]:
+        """The place of each that is queued among its tenant's, 1 for the one that is next: how many others wait is
         theirs to know."""
+        ids = [job.id for job in among if job.state is State.QUEUED]
+        if not ids:
+            return {}
+        places = (
+            sa.select(jobs.c.id, _place().label("place")).where(jobs.c.state == State.QUEUED, self._mine()).subquery()
+        )
         with self._database.reading() as read:
-            query = sa.select(jobs.c.id, _place()).where(jobs.c.state == State.QUEUED, self._mine())
-            return {job_id: int(number) for job_id, number in read.execute(query).all()}
+            found = read.execute(sa.select(places.c.id, places.c.place).where(places.c.id.in_(ids))).all()
+        return {job_id: int(place) for job_id, place in found}
 
     def position(self, job: Job) -> int:
         """That of one queued job."""

@@ -125,7 +125,8 @@ def test_pages_and_positions(ledger: Ledger, new_job: NewJob) -> None:
 def test_many_and_the_queue(ledger: Ledger, new_job: NewJob) -> None:
     jobs = [new_job() for _ in range(4)]
     ledger.claim(jobs[1].id, 1, "here")
-    assert ledger.positions() == {jobs[0].id: 1, jobs[2].id: 2, jobs[3].id: 3}
+    assert ledger.positions(jobs) == {jobs[0].id: 1, jobs[2].id: 2, jobs[3].id: 3}
+    assert ledger.positions(jobs[3:]) == {jobs[3].id: 3} and ledger.positions([]) == {}
     assert [ledger.position(jobs[n]) for n in (0, 2, 3)] == [1, 2, 3], "the same order"
     found = {job.id: job.state for job in ledger.many([jobs[0].id, jobs[1].id, "none"])}
     assert found == {jobs[0].id: State.QUEUED, jobs[1].id: State.RUNNING}
