@@ -158,3 +158,10 @@ def test_freedom_costs_nothing_where_the_geometry_is_right(tmp_path):
     np.testing.assert_array_equal(free.splats.means, fixed.splats.means)
     np.testing.assert_array_equal(free.volume, fixed.volume)
     assert free.static == fixed.static
+
+
+@pytest.mark.slow
+def test_a_small_constant_error_is_not_taken_for_none(tmp_path):
+    scan = scan_of(tmp_path, Simulation(views=40, det=80, noise="none", seed=11, offset_px=(0.1, 0.0)))
+    found = drain(reconstruct(scan, Options(splats=6000, threads=1)))
+    assert found.static["cor_px"] == pytest.approx(axis_column(scan.frames) - 0.1, abs=0.02)
