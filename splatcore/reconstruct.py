@@ -40,7 +40,7 @@ from splatcore.poses import Normals, Prior
 from splatcore.progress import Progress
 from splatcore.pyramid import Level, level
 from splatcore.reconstruction import Reconstruction
-from splatcore.refine import MOVING, Book, Weighing, refine, weigh
+from splatcore.refine import Book, Weighing, refine, weigh
 from splatcore.scan import Scan
 from splatcore.schedule import Clock, Schedule, Stage
 from splatcore.splats import Splats
@@ -50,6 +50,7 @@ from splatcore.trial import held_out_views
 
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
 _WORTH_THREADS = 4_000  # splats
+_JOINT = Rates(end=0.02)  # at the finest level: as long as splats move, poses wander with them
 _MOST_SHOWN = 256**3  # voxels of a draft: more take seconds to make and to write
 _FAINTEST = 1e-30  # line integral; single precision has no room for the squares of less
 
@@ -210,7 +211,7 @@ class _Run:
         drifting = self._options.exposure and (here.factor > finest or self._schedule.levels == 1)
         measured, here = here.images, calibration.steady(here)
         if not self._under_way:
-            self._descent = self._start(stage, here, MOVING if last else Rates())
+            self._descent = self._start(stage, here, _JOINT if last else Rates())
             self._under_way = {"step": 0, "order": [], "loss": 0.0}
             yield self.progress(
                 "level", f"binning {here.factor}: {len(self._descent.splats)} splats", level=here.factor,

@@ -27,11 +27,11 @@ _FORGET, _TRIAL_STEPS, _RESTING = 900, 400, 600
 _PLAIN = 0.5  # of the stage's steps, where the images hold enough to go on without a prior: more follow the noise
 _SURE = 2.0  # standard errors of the mean difference, over the views left out, by which a weight must win
 _EVERY = 2  # steps of Adam to one of the variation, which is twice as strong then
-_REST = 0.15  # rates at the end of the stage before, of those at its beginning
+_REST = 0.15  # rates at which splats come to rest, of those at the beginning of a level
 _HIGH = 0.9  # to which they rise again
 _CORNER = 1.345  # standard deviations: Huber's corner that is 95 % efficient on normal noise (Huber 1964)
 
-MOVING = Rates(end=_REST)  # of the stage before
+FORGETTING = Rates(end=_REST)  # views left out
 
 
 @dataclass(frozen=True)
@@ -140,12 +140,12 @@ def weigh(
 
     def unseen(start: Descent, weight: float) -> Generator[float, None, Array]:
         """Mean squared residuals of the views left out, once the splats have come to rest."""
-        branch = start.branch(_TRIAL_STEPS, MOVING.times(_REST), corner)
+        branch = start.branch(_TRIAL_STEPS, FORGETTING.times(_REST), corner)
         yield from Refinement(branch, here, kept, weight, np.random.default_rng(seed)).run(frames, _TRIAL_STEPS, book)
         return np.array([r @ r / r.size for r in _residuals(branch, here, frames, held)])
 
     def forget(start: Descent, seed: int) -> Generator[float, None, Descent]:
-        branch = start.branch(_FORGET, MOVING, corner)
+        branch = start.branch(_FORGET, FORGETTING, corner)
         yield from Refinement(branch, here, kept, 0.0, np.random.default_rng(seed)).run(frames, _FORGET, book)
         return branch
 
@@ -176,7 +176,7 @@ def refine(
     """The refinement with all views, yet to be run, and its number of steps: `steps` at most."""
     rates = Rates().times(_HIGH)
     if not weighing.further:
-        rates, steps = MOVING.times(_REST), min(steps, _RESTING)
+        rates, steps = FORGETTING.times(_REST), min(steps, _RESTING)
     elif not weighing.weight:
         steps = int(_PLAIN * steps)
     branch = weighing.start.branch(steps, rates, _noise(weighing.start, here, frames))

@@ -13,7 +13,7 @@ from splatcore.pyramid import factors
 from splatcore.scan import Scan
 
 # Adam steps at each binning factor. Coarse steps cost a hundredth of fine ones.
-_STEPS = {8: 600, 4: 750, 2: 1200, 1: 2000}
+_STEPS = {8: 600, 4: 750, 2: 1200, 1: 2500}
 _REFINING, _REFINING_EPOCHS = 6000, 100  # at most, of the last stage, poses at rest
 _MOST_EPOCHS = 200
 _QUALITY = {"preview": 1.0, "normal": 1.0, "fine": 1.5}

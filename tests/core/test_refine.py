@@ -17,7 +17,7 @@ from splatcore.progress import Progress
 from splatcore.pyramid import level
 from splatcore.reconstruct import drain, reconstruct
 from splatcore.reconstruction import Reconstruction
-from splatcore.refine import MOVING, WEIGHTS, Refinement, Weighing, refine
+from splatcore.refine import FORGETTING, WEIGHTS, Refinement, Weighing, refine
 from splatcore.scan import Scan, read_scan
 from splatcore.scores import psnr
 from splatcore.simulate import Simulation, simulate
@@ -151,7 +151,7 @@ def test_a_branch_goes_its_own_way(tmp_path):
     for view in range(5):
         trunk.step(packed[view], True, here.images[view], None)
     before = [array.copy() for array in trunk.splats.arrays()]
-    branches = [trunk.branch(20, MOVING, 1e-3) for _ in range(2)]
+    branches = [trunk.branch(20, FORGETTING, 1e-3) for _ in range(2)]
     for view in range(5, 10):
         for branch in branches:
             branch.step(packed[view], True, here.images[view], None)
@@ -183,10 +183,12 @@ def test_where_the_images_hold_no_more_it_soon_comes_to_rest(tmp_path):
         assert refine(Weighing(weight, trunk, further), here, here.nominal, 3000, rng)[1] == steps
 
 
-@pytest.mark.parametrize(("noise", "further"), [("none", True), ("r2", False)])
-def test_views_left_out_say_whether_going_on_helps(tmp_path, monkeypatch, noise, further):
-    """Without noise there is nothing wrong to be followed; in few splats' worth of noisy pixels there is."""
+@pytest.mark.parametrize(
+    ("what", "further"), [({"noise": "none", "views": 60}, True), ({"i0": 1000.0, "views": 24}, False)]
+)
+def test_views_left_out_say_whether_going_on_helps(tmp_path, monkeypatch, what, further):
+    """Without noise there is nothing wrong to be followed; in a few noisy views there is (22.2 in place of 22.6 dB)."""
     monkeypatch.setattr("splatcore.refine.WEIGHTS", (0.0,))
-    simulate(sharp(), tmp_path, replace(NOISY, noise=noise, views=60), threads=1, name="object")
+    simulate(sharp(), tmp_path, replace(NOISY, **what), threads=1, name="object")
     evidence = weighing(drain(reconstruct(read_scan(tmp_path), FIXED)))
     assert evidence["weight"] == 0 and evidence["further"] is further
