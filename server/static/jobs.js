@@ -102,9 +102,15 @@ async function lookForWorkers() {
 // No stream tells of jobs that are not among the newest.
 async function lookAtOlder() {
   if (!reached || jobs.length <= PAGE) return;
-  const count = Math.min(jobs.length - PAGE, MOST);
-  const page = await call(`/v1/jobs?limit=${count}&before=${encodeURIComponent(jobs[PAGE - 1].id)}`);
-  jobs = [...jobs.slice(0, PAGE), ...page.jobs, ...jobs.slice(PAGE + count)];
+  const last = jobs[PAGE - 1];
+  const asked = new Set(jobs.slice(PAGE, PAGE + MOST).map(({ id }) => id));
+  const count = asked.size;
+  const page = await call(`/v1/jobs?limit=${count}&before=${encodeURIComponent(last.id)}`);
+  const from = jobs.findIndex(({ id }) => id === last.id) + 1; // newer ones may have come meanwhile
+  if (from === 0) return; // it was deleted: next time
+  const found = new Set(page.jobs.map(({ id }) => id));
+  const beyond = jobs.slice(from).filter(({ id }) => !asked.has(id) && !found.has(id));
+  jobs = [...jobs.slice(0, from), ...page.jobs, ...beyond];
   show();
   if (page.jobs.length === count) return;
   byId("older").hidden = page.next === null;

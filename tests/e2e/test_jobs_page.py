@@ -7,7 +7,7 @@ import time
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from server.keys import KeyRing, Scope
 from worker.contract import State
@@ -108,6 +108,26 @@ def test_older_jobs_are_looked_at_now_and_then(browser: Browser, stage: Stage) -
     expect(rows.nth(50)).to_contain_text("cancelled", timeout=15_000)
     expect(rows).to_have_count(51)
     page.close()
+
+
+def test_a_job_that_comes_while_older_ones_are_asked_for_hides_none(page: Page, stage: Stage) -> None:
+    now = time.time()
+    for number in range(55):
+        stage.job(f"job {number}", State.CANCELLED, created_at=now - 10 - number)
+    page.goto("/")
+    page.get_by_role("button", name="Show older jobs").click()
+    rows = page.locator("#rows tr")
+    expect(rows).to_have_count(55)
+    held: list[Route] = []
+    page.route("**/v1/jobs?limit=5&before=*", lambda route: held.append(route))
+    with page.expect_request("**/v1/jobs?limit=5&before=*", timeout=15_000):
+        pass
+    stage.job("new")
+    expect(rows).to_have_count(56)
+    with page.expect_response("**/v1/jobs?limit=5&before=*"):
+        held[0].continue_()
+    page.wait_for_timeout(200)  # for the page to take it in
+    assert page.locator("#rows th a").all_inner_texts() == ["new", *(f"job {number}" for number in range(55))]
 
 
 def test_asking_too_often_is_not_the_end(browser: Browser, stage: Stage) -> None:
