@@ -17,6 +17,7 @@ import numpy as np
 
 from splatcore.descent import Descent
 from splatcore.geometry import Array, Frames, RigidMotions
+from splatcore.lowpass import HUBER, NORMAL
 from splatcore.motionmodel import Curve, constant_motion, smooth_motion
 from splatcore.poses import Normals, Prior, accumulate
 from splatcore.pyramid import Level
@@ -29,7 +30,6 @@ MODELS: tuple[Model, ...] = ("none", "static", "smooth", "full")
 _SQUARE = 4  # pixels: neighbours share noise and the model's own error
 _STEPS = 2  # Gauss-Newton steps of a view set free
 _DAMPING = 1e-3
-_HUBER = 2.0  # standard deviations of the residual, as in the sweeps
 # A model that would more than double the squared residual of some view is wrong: nothing needs to be tried.
 _HOPELESS = 1.0
 _WORDS = {
@@ -174,7 +174,7 @@ def _fitted(
 
 
 def _huber(normals: Normals) -> float:
-    return _HUBER * 1.2533 * float(normals.residual_abs.sum() / max(normals.pixels.sum(), 1.0))
+    return HUBER * NORMAL * float(normals.residual_abs.sum() / max(normals.pixels.sum(), 1.0))
 
 
 def _harm(prediction: RigidMotions, motions: RigidMotions, normals: Normals) -> float:

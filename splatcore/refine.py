@@ -16,6 +16,7 @@ import numpy as np
 
 from splatcore.descent import Descent, Rates, require_finite
 from splatcore.geometry import Array, Frames
+from splatcore.lowpass import NORMAL
 from splatcore.pyramid import Level
 from splatcore.splats import Floats
 from splatcore.trial import Indices
@@ -187,7 +188,7 @@ def _noise(descent: Descent, here: Level, frames: Frames) -> float:
     """Huber's corner for the residual of a few views, taken for noise. Line integral."""
     views = np.arange(0, len(frames), max(1, len(frames) // 8))
     size = np.mean([np.abs(r).mean() for r in _residuals(descent, here, frames, views)])
-    return max(_CORNER * 1.2533 * float(size), 1e-6 * float(here.images.max()))
+    return max(_CORNER * NORMAL * float(size), 1e-6 * float(here.images.max()))
 
 
 def _residuals(descent: Descent, here: Level, frames: Frames, views: Indices) -> Generator[Floats, None, None]:
