@@ -55,17 +55,21 @@ def level(scan: Scan, factor: int) -> Level:
     """The scan binned by `factor`, on a grid whose voxels are as many times larger. A detector's short side, a few
     rows or a single one, is binned by less, so that no less than 24 pixels are left where there were as many."""
     binning = (_factor_of(scan.frames.rows, factor), _factor_of(scan.frames.cols, factor))
-    grid, good = scan.volume, None if scan.bad_pixels is None else (~scan.bad_pixels).astype(np.float32)
-    down = tuple(1 if n == 1 else factor for n in grid.shape)  # a single slice stays as thick as it is
-    coarse = VolumeGrid(
-        (-(-grid.shape[0] // down[0]), -(-grid.shape[1] // down[1]), -(-grid.shape[2] // down[2])),
-        (grid.voxel_mm[0] * down[0], grid.voxel_mm[1] * down[1], grid.voxel_mm[2] * down[2]),
-        grid.center_mm,
-    )
+    good = None if scan.bad_pixels is None else (~scan.bad_pixels).astype(np.float32)
     mask = None if good is None else means_of_blocks(good[None], binning)[0]
     return Level(
-        factor, binning, scan.frames.binned(*binning), means_of_blocks(scan.projections, binning, good), mask, coarse
-    )
+        factor, binning, scan.frames.binned(*binning), means_of_blocks(scan.projections, binning, good), mask,
+        coarser(scan.volume, factor),
+    )  # fmt: skip
+
+
+def coarser(grid: VolumeGrid, factor: int) -> VolumeGrid:
+    """The grid whose voxels are so many times larger. A single slice stays as thick as it is."""
+    nz, ny, nx = grid.shape
+    down = (1 if nz == 1 else factor, 1 if ny == 1 else factor, 1 if nx == 1 else factor)
+    vz, vy, vx = grid.voxel_mm
+    shape = (-(-nz // down[0]), -(-ny // down[1]), -(-nx // down[2]))
+    return VolumeGrid(shape, (vz * down[0], vy * down[1], vx * down[2]), grid.center_mm)
 
 
 def _factor_of(side: int, factor: int) -> int:

@@ -38,7 +38,7 @@ from splatcore.orientation import finding as orientation_finding
 from splatcore.planar import Plane, common_plane
 from splatcore.poses import Normals, Prior
 from splatcore.progress import Progress
-from splatcore.pyramid import Level, level
+from splatcore.pyramid import Level, coarser, level
 from splatcore.reconstruction import Reconstruction
 from splatcore.refine import Book, Weighing, refine, weigh
 from splatcore.scan import Scan
@@ -46,6 +46,7 @@ from splatcore.schedule import Clock, Schedule, Stage
 from splatcore.splats import Splats
 from splatcore.start import first_splats
 from splatcore.static import Static
+from splatcore.structure import aligned
 from splatcore.trial import held_out_views
 
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
@@ -267,6 +268,9 @@ class _Run:
             calibration.settle_yaw()
         frames = calibration.corrected(here.nominal)
         splats, unit = first_splats(here.images, frames, here.grid, work.splats, self._rng, self._threads)
+        if self._descent is not None and here.factor == self._schedule.finest:
+            grid = coarser(self._scan.volume, 2 * here.factor)  # of the level above
+            splats = aligned(splats, self._descent.splats.voxelize(grid, self._threads), grid)
         # A level this small is done before a second thread is awake.
         threads = self._threads if len(splats) >= _WORTH_THREADS else 1
         return Descent(
