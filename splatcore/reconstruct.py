@@ -143,7 +143,7 @@ class _Run:
         """All that `go_on` needs, between any two steps."""
         weighed = None
         if self._weighing is not None:
-            weighed = {name: getattr(self._weighing, name) for name in ("weight", "further", "residuals", "views")}
+            weighed = {name: getattr(self._weighing, name) for name in ("weight", "further", "apart")}
         return {
             "verdict": self._orientation, "stage": self._stage, "fraction": self._fraction,
             "clock": self._clock.state(),

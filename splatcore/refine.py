@@ -3,7 +3,7 @@
 While poses move, the splats must follow the images and nothing else: a prior on the volume would bend the poses to
 it. Once they rest, the rates rise again and two things change. The loss becomes quadratic within the noise, which
 averages noise better than L1 does. And the volume may be asked for little total variation: an object of few sharp
-materials gains decibels by it, a smooth one loses. Views left out for a while say which it is.
+materials gains decibels by it, a smooth one loses. Two volumes, of half the views each, say which it is.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ import numpy as np
 from splatcore.descent import Descent, Rates, require_finite
 from splatcore.geometry import Array, Frames
 from splatcore.lowpass import NORMAL
-from splatcore.pyramid import Level
+from splatcore.pyramid import Level, coarser
 from splatcore.splats import Floats
 from splatcore.trial import Indices
 from splatcore.variation import Variation
 
 WEIGHTS = (0.0, 0.02, 0.05)  # of the total variation beside the mean loss; each is tried if the one before won
-_UNSEEN_WEIGHT = 0.02  # where no view can be left out: so few views need a prior
-_FORGET, _TRIAL_STEPS, _RESTING = 900, 400, 600
+_UNSEEN_WEIGHT = 0.02  # where there are too few views to choose: so few need a prior
+_FORGET, _TRIAL_STEPS, _RESTING = 900, 400, 600  # half the views are forgotten in half the steps
 _PLAIN = 0.5  # of the stage's steps, where the images hold enough to go on without a prior: more follow the noise
-_SURE = 2.0  # standard errors of the mean difference, over the views left out, by which a weight must win
+_SURE = 2.0  # standard errors of the mean difference, over the views left out, by which going on must win
 _EVERY = 2  # steps of Adam to one of the variation, which is twice as strong then
 _REST = 0.15  # rates at which splats come to rest, of those at the beginning of a level
 _HIGH = 0.9  # to which they rise again
@@ -42,23 +42,22 @@ class Weighing:
     weight: float
     start: Descent = field(repr=False)
     further: bool = True  # whether to go on at high rates, or to come to rest
-    residuals: tuple[tuple[float, float], ...] = ()  # weight, rms residual of the views left out
-    views: int = 0  # left out
+    apart: tuple[tuple[float, float], ...] = ()  # weight, rms difference from the other half's volume, 1/mm
 
     def finding(self) -> dict[str, Any]:
         """For the report (`splatcore.report`)."""
-        if not self.residuals:
-            text = f"Total variation counted with weight {self.weight:g}; no view could be left out to choose it."
+        if not self.apart:
+            text = f"Total variation counted with weight {self.weight:g}; too few views to choose it."
         else:
-            plain, best = self.residuals[0][1], dict(self.residuals)[self.weight]
-            gain = f"{1 - best / plain:.2%} better than without" if self.weight else "not clearly better with more"
-            text = f"Total variation counted with weight {self.weight:g}: views left out were predicted {gain}."
+            plain, best = self.apart[0][1], dict(self.apart)[self.weight]
+            gain = f"{1 - best / plain:.1%} nearer by it" if self.weight else "no nearer with more"
+            text = f"Total variation counted with weight {self.weight:g}: volumes of half the views each are {gain}."
             if not self.further:
                 text += " Going on without it would have followed the noise, so the volume came to rest early."
-        evidence = {f"residual_at_{weight:g}": rms for weight, rms in self.residuals}
+        evidence = {f"apart_at_{weight:g}": rms for weight, rms in self.apart}
         return {
             "name": "smoothness of the volume", "severity": "ok", "text": text,
-            "evidence": {"weight": self.weight, "held_out_views": self.views, "further": self.further, **evidence},
+            "evidence": {"weight": self.weight, "further": self.further, **evidence},
         }  # fmt: skip
 
 
@@ -130,39 +129,55 @@ class Book:
 def weigh(
     descent: Descent, here: Level, frames: Frames, held: Indices, seed: int, book: Book | None = None
 ) -> Generator[float, None, Weighing]:
-    """The weight of the variation that best predicts views (indices) left out. Yields losses.
+    """The weight of the variation under which one half of the views comes nearest to the volume of the other half.
+    Yields losses.
 
-    First the splats forget those views: rates rise, the other views are drawn. Then short branches, one for each
-    weight, come to rest. Where no weight helps, another branch first forgets for as long again: does going on help?"""
+    Splats first forget the other half: rates rise, every second view is drawn. Then short branches, one for each
+    weight, come to rest. The other half's volume, made without variation, is as wrong as its own noise and streaks
+    make it, whatever the weight here; so what is nearest to it is nearest to the truth. Where no weight brings a
+    volume nearer, views left out (indices) say whether going on helps."""
     if not len(held):
         return Weighing(_UNSEEN_WEIGHT, descent)
-    kept = np.setdiff1d(np.arange(len(frames)), held)
     corner = _noise(descent, here, frames)
+    grid = coarser(here.grid, 2)  # every eighth voxel is enough to tell
 
-    def unseen(start: Descent, weight: float) -> Generator[float, None, Array]:
-        """Mean squared residuals of the views left out, once the splats have come to rest."""
-        branch = start.branch(_TRIAL_STEPS, FORGETTING.times(_REST), corner)
-        yield from Refinement(branch, here, kept, weight, np.random.default_rng(seed)).run(frames, _TRIAL_STEPS, book)
-        return np.array([r @ r / r.size for r in _residuals(branch, here, frames, held)])
-
-    def forget(start: Descent, seed: int) -> Generator[float, None, Descent]:
-        branch = start.branch(_FORGET, FORGETTING, corner)
-        yield from Refinement(branch, here, kept, 0.0, np.random.default_rng(seed)).run(frames, _FORGET, book)
+    def forget(start: Descent, kept: Indices, seed: int, steps: int = _FORGET) -> Generator[float, None, Descent]:
+        branch = start.branch(steps, FORGETTING, corner)
+        yield from Refinement(branch, here, kept, 0.0, np.random.default_rng(seed)).run(frames, steps, book)
         return branch
 
-    forgetful = yield from forget(descent, seed)
-    found: list[tuple[float, float]] = []
-    best, least = 0.0, np.zeros(0)
-    for weight in WEIGHTS:
-        missed = yield from unseen(forgetful, weight)
-        found.append((weight, float(np.sqrt(missed.mean()))))
-        if len(found) > 1 and not _clearly_less(missed, least):
+    def rest(start: Descent, kept: Indices, weight: float) -> Generator[float, None, Descent]:
+        branch = start.branch(_TRIAL_STEPS, FORGETTING.times(_REST), corner)
+        yield from Refinement(branch, here, kept, weight, np.random.default_rng(seed)).run(frames, _TRIAL_STEPS, book)
+        return branch
+
+    halves = [np.arange(first, len(frames), 2) for first in (0, 1)]
+    forgetful, volumes = [], []
+    for half in halves:
+        forgetful.append((yield from forget(descent, half, seed, _FORGET // 2)))
+        volumes.append((yield from rest(forgetful[-1], half, 0.0)).splats.voxelize(grid, descent.threads))
+    found = [(0.0, _rms(volumes[0] - volumes[1]))]
+    for weight in WEIGHTS[1:]:
+        squares = []
+        for half, start, other in zip(halves, forgetful, reversed(volumes), strict=True):
+            settled = yield from rest(start, half, weight)
+            squares.append(_rms(settled.splats.voxelize(grid, descent.threads) - other) ** 2)
+        found.append((weight, float(np.sqrt(np.mean(squares)))))
+        if found[-1][1] >= found[-2][1]:
             break
-        best, least = weight, missed
+    best = min(found, key=lambda each: each[1])[0]
     if best:
-        return Weighing(best, forgetful, True, tuple(found), len(held))
-    later = yield from unseen((yield from forget(forgetful, seed + 1)), 0.0)
-    return Weighing(best, descent, _clearly_less(later, least), tuple(found), len(held))
+        return Weighing(best, descent, True, tuple(found))
+    kept = np.setdiff1d(np.arange(len(frames)), held)
+    near = yield from forget(descent, kept, seed)
+    sooner = yield from rest(near, kept, 0.0)
+    later = yield from rest((yield from forget(near, kept, seed + 1)), kept, 0.0)
+    missed = [np.array([r @ r / r.size for r in _residuals(each, here, frames, held)]) for each in (later, sooner)]
+    return Weighing(best, descent, _clearly_less(*missed), tuple(found))
+
+
+def _rms(difference: Floats) -> float:
+    return float(np.sqrt(np.mean(difference.astype(np.float64) ** 2)))
 
 
 def _clearly_less(one: Array, other: Array) -> bool:
