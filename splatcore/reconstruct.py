@@ -130,7 +130,7 @@ class _Run:
         self._clock, self._schedule = Clock(), Schedule(scan, options)
         self._calibration = Calibration(scan, options)
         self._stage = 0  # number of the present one
-        self._rng = self._draws()
+        self._rng = self._draws(self._stage)
         self._here: Level | None = None  # what it works at, as the scan has it
         self._descent: Descent | None = None  # of the finest level so far
         self._under_way: dict[str, Any] = {}  # of the present level: step, views left in this epoch, loss
@@ -167,9 +167,9 @@ class _Run:
                 self._descent = Descent.from_state(self._earlier[0]["descent"])
             self._weighing = Weighing(start=self._descent, **state["weighed"])
 
-    def _draws(self) -> np.random.Generator:
+    def _draws(self, stage: int) -> np.random.Generator:
         """Of each stage its own, so that what came before it decides nothing but where it begins."""
-        return np.random.default_rng([self._options.seed, self._stage])
+        return np.random.default_rng([self._options.seed, stage])
 
     def progress(self, stage: str, message: str, **facts: object) -> Progress:
         return Progress(stage, self._fraction, message, self._clock.seconds, **facts)  # type: ignore[arg-type]
@@ -184,7 +184,7 @@ class _Run:
             with self._clock.timed(f"binning_{stage.factor}" if stage.kind == "level" else stage.kind):
                 yield from parts[stage.kind](stage, self._here)
             self._stage, self._under_way, self._book = self._stage + 1, {}, None
-            self._rng = self._draws()
+            self._rng = self._draws(self._stage)
             self._keeper.pause(self.state, stage_ends=True)
             if stage.kind == "level" and self._stage < len(self._schedule.stages):
                 yield from self._show(self._here)
@@ -282,9 +282,16 @@ class _Run:
 
     def _gate(self, stage: Stage, here: Level) -> Generator[Progress, None, None]:
         """Before the finest level: how freely views may move from here on."""
-        sentence = self._calibration.gate(here)
-        if sentence is not None:
+        if not self._under_way:
+            sentence = self._calibration.gate(here)
+            if sentence is None:
+                return
             yield self.progress("poses", sentence, level=here.factor)
+            if not self._calibration.fixed:
+                return
+            self._rng = self._draws(self._stage - 1)
+        # Nothing was wrong. The finest level begins with what this one shows: as it is without any calibration.
+        yield from self._level(self._schedule.stages[self._stage - 1], here)
 
     def _refine(self, stage: Stage, here: Level) -> Generator[Progress, None, None]:
         """The last stage: the poses rest, the volume gets its detail (splatcore.refine)."""
