@@ -156,12 +156,12 @@ def weigh(
     for half in halves:
         forgetful.append((yield from forget(descent, half, seed, _FORGET // 2)))
         volumes.append((yield from rest(forgetful[-1], half, 0.0)).splats.voxelize(grid, descent.threads))
-    found = [(0.0, _rms(volumes[0] - volumes[1]))]
+    found = [(0.0, float(np.sqrt(_mean_square(volumes[0] - volumes[1]))))]
     for weight in WEIGHTS[1:]:
         squares = []
         for half, start, other in zip(halves, forgetful, reversed(volumes), strict=True):
             settled = yield from rest(start, half, weight)
-            squares.append(_rms(settled.splats.voxelize(grid, descent.threads) - other) ** 2)
+            squares.append(_mean_square(settled.splats.voxelize(grid, descent.threads) - other))
         found.append((weight, float(np.sqrt(np.mean(squares)))))
         if found[-1][1] >= found[-2][1]:
             break
@@ -176,8 +176,8 @@ def weigh(
     return Weighing(best, descent, _clearly_less(*missed), tuple(found))
 
 
-def _rms(difference: Floats) -> float:
-    return float(np.sqrt(np.mean(difference.astype(np.float64) ** 2)))
+def _mean_square(difference: Floats) -> float:
+    return float(np.mean(difference.astype(np.float64) ** 2))
 
 
 def _clearly_less(one: Array, other: Array) -> bool:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from splatcore.geometry import Array
 from splatcore.grid import VolumeGrid
+from splatcore.reference import rotations
 from splatcore.splats import Floats, Splats
 from splatcore.structure import aligned
 
@@ -28,13 +30,7 @@ def soft(distance: Array) -> Floats:
 
 def axes_of(splats: Splats) -> Array:
     """Unit vectors along each splat's own axes, its columns. [n, 3, 3]"""
-    w, x, y, z = splats.quats.astype(np.float64).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
+    return np.asarray(rotations(torch.from_numpy(splats.quats.astype(np.float64))).numpy())
 
 
 def own_axis(splats: Splats, chosen: Array) -> Array:
