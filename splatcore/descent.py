@@ -22,9 +22,9 @@ _REMADE = ("renderer", "gradient")  # scratch: nothing in them outlasts a step
 class Rates:
     """Adam step sizes at the start of a level; all fall exponentially to `end` times that."""
 
-    mean: float = 0.05  # voxels of the level's grid
-    log_scale: float = 0.01
-    quat: float = 0.01
+    mean: float = 0.03  # voxels of the level's grid
+    log_scale: float = 0.02
+    quat: float = 0.0015
     density: float = 0.02  # of the raw parameter, density = unit * softplus(raw)
     end: float = 0.1
 
@@ -59,11 +59,11 @@ class Descent:
         scale_limits: tuple[float, float] | None = None,
         plane: Plane | None = None,
     ) -> None:
-        """scale_limits: the smallest and largest standard deviation, mm; 0.15 and 20 voxels where left out.
+        """scale_limits: the smallest and largest standard deviation, mm; 0.3 and 20 voxels where left out.
         plane: where all splats stay, of a line detector."""
         self._rows, self._cols = rows, cols
         self.renderer = _native.Renderer32(rows, cols, threads)
-        self._limits = scale_limits or (0.15 * voxel_mm, 20 * voxel_mm)
+        self._limits = scale_limits or (0.3 * voxel_mm, 20 * voxel_mm)
         self._unit, self._steps, self._rates, self._voxel = density_unit, max(steps, 1), rates, voxel_mm
         self._huber, self._dssim, self._range, self.threads = huber, dssim, data_range, threads
         self._plane = plane
@@ -84,8 +84,9 @@ class Descent:
 
     def repopulate(self, splats: Splats, parent: NDArray[np.intp]) -> None:
         """Go on from a changed population. parent [len(splats)]: the present row whose moments a splat keeps; -1 for
-        a new one, whose moments are zero."""
+        a new one, whose moments are zero. Where all are new it is as at the first step."""
         kept = parent >= 0
+        self._age = self._age if kept.any() else 0
         old, new = len(self.splats), len(splats)
         for name in ("_first", "_second"):
             before, after = getattr(self, name), np.zeros(11 * new, np.float32)

@@ -15,7 +15,7 @@ from splatcore.options import Options
 _FEWEST_SPLATS, _MOST_SPLATS = 2_000, 2_000_000
 _COMPARED = {"r2": 50_000, "paper": 50_000}  # splats of the methods that start with a fixed number
 _PARAMETERS = 37  # float32 of a splat under optimisation: itself, raw parameters, Adam's moments
-_STATES = 8  # descents at once, at most, in memory and in a checkpoint
+_STATES = 12  # descents at once, at most, in memory and in a checkpoint
 _OF_NORMAL = {"preview": 0.3, "normal": 1.0, "fine": 1.5}  # time
 _OF_FULL = {"full": 1.0, "static": 0.9, "none": 0.6}
 _STEP_S = 0.034  # of the compared methods, with 50,000 splats and 512^2 pixels
@@ -32,10 +32,8 @@ class Estimate:
 
 
 def default_splats(voxels: int) -> int:
-    """Gaussians at full resolution. Finer voxels show more detail, but as few views hold it no better: past 128 an
-    edge many more splats would fit noise."""
-    edge = voxels ** (1 / 3) / 128
-    return int(min(max(30_000 * min(edge**1.5, edge**0.5), _FEWEST_SPLATS), _MOST_SPLATS))
+    """Gaussians at full resolution: as surfaces grow, less what is smooth."""
+    return min(max(round(30_000 * (voxels ** (1 / 3) / 128) ** 1.5), _FEWEST_SPLATS), _MOST_SPLATS)
 
 
 def estimate(views: int, rows: int, cols: int, shape: Sequence[int], options: Options) -> Estimate:

@@ -47,7 +47,6 @@ from splatcore.splats import Splats
 from splatcore.start import first_splats
 from splatcore.static import Static
 from splatcore.structure import aligned
-from splatcore.trial import held_out_views
 
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
 _WORTH_THREADS = 4_000  # splats
@@ -300,7 +299,7 @@ class _Run:
         assert self._descent is not None
         if self._weighing is None:
             self._book = Book(self._pause, self._earlier)
-            trial = weigh(self._descent, here, frames, held_out_views(len(frames)), self._options.seed, self._book)
+            trial = weigh(self._descent, here, frames, self._options.seed, self._book)
             while self._weighing is None:
                 try:
                     loss = next(trial)

@@ -15,24 +15,27 @@ from typing import Any
 import numpy as np
 
 from splatcore.descent import Descent, Rates, require_finite
-from splatcore.geometry import Array, Frames
+from splatcore.geometry import Frames
 from splatcore.lowpass import NORMAL
 from splatcore.pyramid import Level, coarser
 from splatcore.splats import Floats
+from splatcore.start import first_splats
+from splatcore.structure import aligned
 from splatcore.trial import Indices
-from splatcore.variation import Variation
+from splatcore.variation import BOX, Variation
 
 WEIGHTS = (0.0, 0.02, 0.05)  # of the total variation beside the mean loss; each is tried if the one before won
 _UNSEEN_WEIGHT = 0.02  # where there are too few views to choose: so few need a prior
-_FORGET, _TRIAL_STEPS, _RESTING = 900, 400, 600  # half the views are forgotten in half the steps
+_FEWEST_VIEWS = 16
+_HALF_STEPS, _TRIAL_STEPS = 1000, 400  # of a volume of half the views, and of each branch of it
+_TRIAL_RATES = 0.3  # at which a branch begins, of those at the beginning of a level
+_NOISIER = 2**0.5  # half as many views: so much more noise, and as much more variation to take it away
 _PLAIN = 0.5  # of the stage's steps, where the images hold enough to go on without a prior: more follow the noise
-_SURE = 2.0  # standard errors of the mean difference, over the views left out, by which going on must win
 _EVERY = 2  # steps of Adam to one of the variation, which is twice as strong then
-_REST = 0.15  # rates at which splats come to rest, of those at the beginning of a level
-_HIGH = 0.9  # to which they rise again
+_BOX = 4  # boxes of the variation along an edge: at every resolution each place is visited as often
+_HIGH = 0.9  # rates, of those at the beginning of a level, to which splats rise again
+_SETTLING = Rates(end=0.15)
 _CORNER = 1.345  # standard deviations: Huber's corner that is 95 % efficient on normal noise (Huber 1964)
-
-FORGETTING = Rates(end=_REST)  # views left out
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Weighing:
 
     weight: float
     start: Descent = field(repr=False)
-    further: bool = True  # whether to go on at high rates, or to come to rest
+    further: bool = True  # whether to go on at all
     apart: tuple[tuple[float, float], ...] = ()  # weight, rms difference from the other half's volume, 1/mm
 
     def finding(self) -> dict[str, Any]:
@@ -53,7 +56,7 @@ class Weighing:
             gain = f"{1 - best / plain:.1%} nearer by it" if self.weight else "no nearer with more"
             text = f"Total variation counted with weight {self.weight:g}: volumes of half the views each are {gain}."
             if not self.further:
-                text += " Going on without it would have followed the noise, so the volume came to rest early."
+                text += " Going on without it would have followed the noise, so the volume was left as it was."
         evidence = {f"apart_at_{weight:g}": rms for weight, rms in self.apart}
         return {
             "name": "smoothness of the volume", "severity": "ok", "text": text,
@@ -67,8 +70,8 @@ class Refinement:
     def __init__(self, descent: Descent, here: Level, views: Indices, weight: float, rng: np.random.Generator) -> None:
         """descent: whose splats are moved; views: indices of those to draw."""
         self.descent, self._here, self._views, self._rng = descent, here, views, rng
-        half = float(here.grid.half_extent_mm().max())
-        self._variation = Variation(here.grid, _EVERY * weight * half, descent.threads) if weight else None
+        half, box = float(here.grid.half_extent_mm().max()), max(BOX, max(here.grid.shape) // _BOX)
+        self._variation = Variation(here.grid, _EVERY * weight * half, descent.threads, box) if weight else None
         self.step = 0
         self._order: list[int] = []  # views still to be drawn in this epoch
         self._loss, self._drawn = 0.0, 0  # of this epoch; its views
@@ -127,75 +130,78 @@ class Book:
 
 
 def weigh(
-    descent: Descent, here: Level, frames: Frames, held: Indices, seed: int, book: Book | None = None
+    descent: Descent, here: Level, frames: Frames, seed: int, book: Book | None = None
 ) -> Generator[float, None, Weighing]:
     """The weight of the variation under which one half of the views comes nearest to the volume of the other half.
     Yields losses.
 
-    Splats first forget the other half: rates rise, every second view is drawn. Then short branches, one for each
-    weight, come to rest. The other half's volume, made without variation, is as wrong as its own noise and streaks
-    make it, whatever the weight here; so what is nearest to it is nearest to the truth. Where no weight brings a
-    volume nearer, views left out (indices) say whether going on helps."""
-    if not len(held):
+    Each half's volume is begun anew, so that they have no noise in common. Then short branches, one for each weight,
+    come to rest. The other half's volume, made without variation, is as wrong as its own noise and streaks make it,
+    whatever the weight here; so what is nearest to it is nearest to the truth. Where no weight brings a volume
+    nearer, the same is asked of going on."""
+    if len(frames) < _FEWEST_VIEWS:
         return Weighing(_UNSEEN_WEIGHT, descent)
     corner = _noise(descent, here, frames)
+    halves = [np.arange(first, len(frames), 2) for first in (0, 1)]
     grid = coarser(here.grid, 2)  # every eighth voxel is enough to tell
 
-    def forget(start: Descent, kept: Indices, seed: int, steps: int = _FORGET) -> Generator[float, None, Descent]:
-        branch = start.branch(steps, FORGETTING, corner)
-        yield from Refinement(branch, here, kept, 0.0, np.random.default_rng(seed)).run(frames, steps, book)
+    def run(branch: Descent, half: int, steps: int, weight: float) -> Generator[float, None, Descent]:
+        draws = np.random.default_rng([seed, half])
+        yield from Refinement(branch, here, halves[half], weight, draws).run(frames, steps, book)
         return branch
 
-    def rest(start: Descent, kept: Indices, weight: float) -> Generator[float, None, Descent]:
-        branch = start.branch(_TRIAL_STEPS, FORGETTING.times(_REST), corner)
-        yield from Refinement(branch, here, kept, weight, np.random.default_rng(seed)).run(frames, _TRIAL_STEPS, book)
-        return branch
+    def rest(starts: Sequence[Descent], weight: float) -> Generator[float, None, list[Floats]]:
+        volumes = []
+        for half, start in enumerate(starts):
+            branch = start.branch(_TRIAL_STEPS, _SETTLING.times(_TRIAL_RATES), corner)
+            branch = yield from run(branch, half, _TRIAL_STEPS, _NOISIER * weight)
+            volumes.append(branch.splats.voxelize(grid, descent.threads))
+        return volumes
 
-    halves = [np.arange(first, len(frames), 2) for first in (0, 1)]
-    forgetful, volumes = [], []
-    for half in halves:
-        forgetful.append((yield from forget(descent, half, seed, _FORGET // 2)))
-        volumes.append((yield from rest(forgetful[-1], half, 0.0)).splats.voxelize(grid, descent.threads))
-    found = [(0.0, float(np.sqrt(_mean_square(volumes[0] - volumes[1]))))]
+    anew = []
+    for half, views in enumerate(halves):
+        branch = _begun_anew(descent, here, frames, views, corner, np.random.default_rng([seed, half]))
+        anew.append((yield from run(branch, half, _HALF_STEPS, 0.0)))
+    plain = yield from rest(anew, 0.0)
+    found = [(0.0, _apart(plain, plain))]
     for weight in WEIGHTS[1:]:
-        squares = []
-        for half, start, other in zip(halves, forgetful, reversed(volumes), strict=True):
-            settled = yield from rest(start, half, weight)
-            squares.append(_mean_square(settled.splats.voxelize(grid, descent.threads) - other))
-        found.append((weight, float(np.sqrt(np.mean(squares)))))
+        found.append((weight, _apart((yield from rest(anew, weight)), plain)))
         if found[-1][1] >= found[-2][1]:
             break
-    best = min(found, key=lambda each: each[1])[0]
+    best, least = min(found, key=lambda each: each[1])
     if best:
         return Weighing(best, descent, True, tuple(found))
-    kept = np.setdiff1d(np.arange(len(frames)), held)
-    near = yield from forget(descent, kept, seed)
-    sooner = yield from rest(near, kept, 0.0)
-    later = yield from rest((yield from forget(near, kept, seed + 1)), kept, 0.0)
-    missed = [np.array([r @ r / r.size for r in _residuals(each, here, frames, held)]) for each in (later, sooner)]
-    return Weighing(best, descent, _clearly_less(*missed), tuple(found))
+    later = []
+    for half, start in enumerate(anew):
+        branch = start.branch(_HALF_STEPS, _SETTLING, corner)
+        later.append((yield from run(branch, half, _HALF_STEPS, 0.0)))
+    return Weighing(best, descent, _apart((yield from rest(later, 0.0)), plain) < least, tuple(found))
 
 
-def _mean_square(difference: Floats) -> float:
-    return float(np.mean(difference.astype(np.float64) ** 2))
+def _begun_anew(
+    descent: Descent, here: Level, frames: Frames, views: Indices, corner: float, rng: np.random.Generator
+) -> Descent:
+    """A descent from the first splats that these views alone would have given. Only shapes come from all views."""
+    threads, grid = descent.threads, coarser(here.grid, 2)
+    splats, _ = first_splats(here.images[views], frames[views], here.grid, len(descent.splats), rng, threads)
+    branch = descent.branch(_HALF_STEPS, _SETTLING, corner)
+    branch.repopulate(aligned(splats, descent.splats.voxelize(grid, threads), grid), np.full(len(splats), -1))
+    return branch
 
 
-def _clearly_less(one: Array, other: Array) -> bool:
-    """Whether `one` is less than `other` in the mean over views by more than chance."""
-    gain = other - one
-    return float(gain.mean()) > _SURE * float(gain.std(ddof=1)) / float(np.sqrt(len(gain)))
+def _apart(volumes: Sequence[Floats], others: Sequence[Floats]) -> float:
+    """The distance of the volume of each half from that of the other half. Root mean square, 1/mm."""
+    squares = [np.mean((a - b).astype(np.float64) ** 2) for a, b in zip(volumes, reversed(others), strict=True)]
+    return float(np.sqrt(np.mean(squares)))
 
 
 def refine(
     weighing: Weighing, here: Level, frames: Frames, steps: int, rng: np.random.Generator
 ) -> tuple[Refinement, int]:
     """The refinement with all views, yet to be run, and its number of steps: `steps` at most."""
-    rates = Rates().times(_HIGH)
-    if not weighing.further:
-        rates, steps = FORGETTING.times(_REST), min(steps, _RESTING)
-    elif not weighing.weight:
-        steps = int(_PLAIN * steps)
-    branch = weighing.start.branch(steps, rates, _noise(weighing.start, here, frames))
+    if not weighing.weight:
+        steps = int(_PLAIN * steps) if weighing.further else 0
+    branch = weighing.start.branch(steps, Rates().times(_HIGH), _noise(weighing.start, here, frames))
     return Refinement(branch, here, np.arange(len(frames)), weighing.weight, rng), steps
 
 

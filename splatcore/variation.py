@@ -14,7 +14,7 @@ from splatcore import _native
 from splatcore.grid import VolumeGrid
 from splatcore.splats import Floats, Splats, grid_array
 
-BOX = 32  # voxels an edge
+BOX = 32  # voxels an edge, as R2-Gaussian has it
 
 
 def total_variation(volume: Floats) -> tuple[float, Floats]:
@@ -43,10 +43,11 @@ class Variation:
     grid: VolumeGrid
     weight: float
     threads: int
+    box: int = BOX  # voxels an edge
 
     def __post_init__(self) -> None:
-        nz, ny, nx = self.grid.shape
-        self._shape = (min(BOX, nz), min(BOX, ny), min(BOX, nx))
+        nz, ny, nx = (min(self.box, n) for n in self.grid.shape)
+        self._shape = (nz, ny, nx)
         self._volume = np.empty(self._shape, np.float32)
         self._half = np.array(self._shape[::-1]) * np.array(self.grid.voxel_mm[::-1]) / 2  # x y z
 
