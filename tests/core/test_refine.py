@@ -12,6 +12,7 @@ from splatcore.calibration import Calibration
 from splatcore.descent import Descent, Rates
 from splatcore.errors import ReconstructionError
 from splatcore.gate import Decision
+from splatcore.grid import VolumeGrid
 from splatcore.options import Options
 from splatcore.progress import Progress
 from splatcore.pyramid import level
@@ -192,3 +193,27 @@ def test_two_halves_say_whether_going_on_helps(tmp_path, monkeypatch, what, furt
     simulate(sharp(), tmp_path, replace(NOISY, **what), threads=1, name="object")
     evidence = weighing(drain(reconstruct(read_scan(tmp_path), FIXED)))
     assert evidence["weight"] == 0 and evidence["further"] is further
+
+
+def test_a_population_that_is_all_new_begins_like_a_first_one(tmp_path):
+    """Without the moments' first steps, which Adam corrects for, it would begin with steps three times as long."""
+    scan = scan_of(sharp(), tmp_path)
+    here, first, worn = level(scan, 1), descent_of(scan), descent_of(scan)
+    frame, splats = here.nominal.packed()[0], descent_of(scan).splats
+    for _ in range(5):
+        worn.step(frame, True, here.images[0], None)
+    again = worn.branch(50, Rates(), 1e-4)
+    again.repopulate(splats, np.full(len(splats), -1))
+    for descent in (first, again):
+        descent.step(frame, True, here.images[0], None)
+    for one, other in zip(first.splats.arrays(), again.splats.arrays(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(("edge", "box"), [(32, 32), (128, 32), (256, 64)])
+def test_every_place_is_visited_as_often_at_every_resolution(tmp_path, edge, box):
+    scan = scan_of(sharp(), tmp_path)
+    here = level(scan, 1)
+    fine = replace(here, grid=VolumeGrid((edge,) * 3, here.grid.voxel_mm, here.grid.center_mm))
+    refinement = Refinement(descent_of(scan), fine, np.arange(4), 0.02, np.random.default_rng(0))
+    assert refinement._variation is not None and refinement._variation.box == box
