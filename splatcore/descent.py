@@ -15,6 +15,7 @@ from splatcore.geometry import Array
 from splatcore.planar import Plane
 from splatcore.splats import Floats, Splats
 
+_LIMITS = (0.3, 20.0)  # voxels: the smallest and largest standard deviation
 _REMADE = ("renderer", "gradient")  # scratch: nothing in them outlasts a step
 
 
@@ -63,7 +64,7 @@ class Descent:
         plane: where all splats stay, of a line detector."""
         self._rows, self._cols = rows, cols
         self.renderer = _native.Renderer32(rows, cols, threads)
-        self._limits = scale_limits or (0.3 * voxel_mm, 20 * voxel_mm)
+        self._limits = scale_limits or (_LIMITS[0] * voxel_mm, _LIMITS[1] * voxel_mm)
         self._unit, self._steps, self._rates, self._voxel = density_unit, max(steps, 1), rates, voxel_mm
         self._huber, self._dssim, self._range, self.threads = huber, dssim, data_range, threads
         self._plane = plane
@@ -107,6 +108,11 @@ class Descent:
         other.gradient = self.splats.zeros_like()
         other.replace(self.splats)
         return other
+
+    def before(self, rows: int, cols: int, voxel_mm: float) -> Descent:
+        """Another descent from the present state, before a detector of other pixels, with the lengths of its voxels."""
+        lengths = {"_voxel": voxel_mm, "_limits": (_LIMITS[0] * voxel_mm, _LIMITS[1] * voxel_mm)}
+        return Descent.from_state(self.state() | {"_rows": rows, "_cols": cols} | lengths)
 
     def state(self) -> dict[str, Any]:
         """All that `from_state` needs to go on with the same bits."""

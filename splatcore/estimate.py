@@ -32,8 +32,9 @@ class Estimate:
 
 
 def default_splats(voxels: int) -> int:
-    """Gaussians at full resolution: as surfaces grow, less what is smooth."""
-    return min(max(round(30_000 * (voxels ** (1 / 3) / 128) ** 1.5), _FEWEST_SPLATS), _MOST_SPLATS)
+    """Gaussians at full resolution: in proportion to its edge, below 128 less."""
+    edge = voxels ** (1 / 3) / 128
+    return min(max(round(30_000 * min(edge**1.5, edge)), _FEWEST_SPLATS), _MOST_SPLATS)
 
 
 def estimate(views: int, rows: int, cols: int, shape: Sequence[int], options: Options) -> Estimate:

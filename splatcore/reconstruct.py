@@ -28,7 +28,7 @@ from splatcore.errors import OptionsError, ReconstructionError
 from splatcore.estimate import default_splats
 from splatcore.exposure import finding
 from splatcore.gate import Decision, Score
-from splatcore.geometry import RigidMotions
+from splatcore.geometry import Frames, RigidMotions
 from splatcore.keeper import Concluding, Keeper
 from splatcore.machine import threads_allowed
 from splatcore.motionmodel import Curve
@@ -52,6 +52,7 @@ _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at mo
 _WORTH_THREADS = 4_000  # splats
 _JOINT = Rates(end=0.02)  # at the finest level: as long as splats move, poses wander with them
 _MOST_SHOWN = 256**3  # voxels of a draft: more take seconds to make and to write
+_WEIGHED_VOXELS = 1.5 * 128**3  # more say the same about smoothness as half the resolution does, in ten times the time
 _FAINTEST = 1e-30  # line integral; single precision has no room for the squares of less
 
 # What a checkpoint may hold beside plain values and arrays.
@@ -299,7 +300,7 @@ class _Run:
         assert self._descent is not None
         if self._weighing is None:
             self._book = Book(self._pause, self._earlier)
-            trial = weigh(self._descent, here, frames, self._options.seed, self._book)
+            trial = weigh(self._descent, *self._weighed_at(stage), self._options.seed, self._book)
             while self._weighing is None:
                 try:
                     loss = next(trial)
@@ -321,6 +322,14 @@ class _Run:
             yield from self._trouble()
         self._calibration.normals = self._calibration.accumulate(here, self._descent)
 
+    def _weighed_at(self, stage: Stage) -> tuple[Level, Frames, int]:
+        """The level at which the last stage finds out how smooth the object is, its frames, and its splats."""
+        factor = stage.factor
+        while self._scan.volume.voxels > factor**3 * _WEIGHED_VOXELS and factor < self._schedule.coarsest:
+            factor *= 2
+        here = self._calibration.steady(level(self._scan, factor))
+        return here, self._calibration.corrected(here.nominal), self._schedule.work(Stage("level", factor)).splats
+
     def _trouble(self) -> Generator[Progress, None, None]:
         """Say so where the state could not be kept, once each time."""
         word, self._keeper.trouble = self._keeper.trouble, ""
@@ -336,7 +345,7 @@ class _Run:
         descent = self._descent
         assert descent is not None  # a run is not interrupted before its first volume
         if not whole:  # at full resolution, though the splats are those of a coarser one
-            descent = Descent.from_state(descent.state() | {"_rows": here.nominal.rows, "_cols": here.nominal.cols})
+            descent = descent.before(here.nominal.rows, here.nominal.cols, here.voxel_mm)
             calibration.normals = calibration.accumulate(here, descent)
         assert calibration.normals is not None
         result = conclude(

@@ -130,10 +130,10 @@ class Book:
 
 
 def weigh(
-    descent: Descent, here: Level, frames: Frames, seed: int, book: Book | None = None
+    descent: Descent, here: Level, frames: Frames, splats: int, seed: int, book: Book | None = None
 ) -> Generator[float, None, Weighing]:
-    """The weight of the variation under which one half of the views comes nearest to the volume of the other half.
-    Yields losses.
+    """The weight of the variation under which one half of the views comes nearest to the volume of the other half,
+    found with so many splats at a level that may be coarser than the descent's. Yields losses.
 
     Each half's volume is begun anew, so that they have no noise in common. Then short branches, one for each weight,
     come to rest. The other half's volume, made without variation, is as wrong as its own noise and streaks make it,
@@ -141,7 +141,8 @@ def weigh(
     nearer, the same is asked of going on."""
     if len(frames) < _FEWEST_VIEWS:
         return Weighing(_UNSEEN_WEIGHT, descent)
-    corner = _noise(descent, here, frames)
+    known = descent.before(here.nominal.rows, here.nominal.cols, here.voxel_mm)
+    corner = _noise(known, here, frames)
     halves = [np.arange(first, len(frames), 2) for first in (0, 1)]
     grid = coarser(here.grid, 2)  # every eighth voxel is enough to tell
 
@@ -160,7 +161,7 @@ def weigh(
 
     anew = []
     for half, views in enumerate(halves):
-        branch = _begun_anew(descent, here, frames, views, corner, np.random.default_rng([seed, half]))
+        branch = _begun_anew(known, here, frames, views, splats, corner, np.random.default_rng([seed, half]))
         anew.append((yield from run(branch, half, _HALF_STEPS, 0.0)))
     plain = yield from rest(anew, 0.0)
     found = [(0.0, _apart(plain, plain))]
@@ -179,11 +180,11 @@ def weigh(
 
 
 def _begun_anew(
-    descent: Descent, here: Level, frames: Frames, views: Indices, corner: float, rng: np.random.Generator
+    descent: Descent, here: Level, frames: Frames, views: Indices, count: int, corner: float, rng: np.random.Generator
 ) -> Descent:
     """A descent from the first splats that these views alone would have given. Only shapes come from all views."""
     threads, grid = descent.threads, coarser(here.grid, 2)
-    splats, _ = first_splats(here.images[views], frames[views], here.grid, len(descent.splats), rng, threads)
+    splats, _ = first_splats(here.images[views], frames[views], here.grid, count, rng, threads)
     branch = descent.branch(_HALF_STEPS, _SETTLING, corner)
     branch.repopulate(aligned(splats, descent.splats.voxelize(grid, threads), grid), np.full(len(splats), -1))
     return branch
