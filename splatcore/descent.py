@@ -15,7 +15,6 @@ from splatcore.geometry import Array
 from splatcore.planar import Plane
 from splatcore.splats import Floats, Splats
 
-_LIMITS = (0.3, 20.0)  # voxels: the smallest and largest standard deviation
 _REMADE = ("renderer", "gradient")  # scratch: nothing in them outlasts a step
 
 
@@ -64,7 +63,7 @@ class Descent:
         plane: where all splats stay, of a line detector."""
         self._rows, self._cols = rows, cols
         self.renderer = _native.Renderer32(rows, cols, threads)
-        self._limits = scale_limits or (_LIMITS[0] * voxel_mm, _LIMITS[1] * voxel_mm)
+        self._limits = scale_limits or (0.3 * voxel_mm, 20 * voxel_mm)
         self._unit, self._steps, self._rates, self._voxel = density_unit, max(steps, 1), rates, voxel_mm
         self._huber, self._dssim, self._range, self.threads = huber, dssim, data_range, threads
         self._plane = plane
@@ -109,10 +108,12 @@ class Descent:
         other.replace(self.splats)
         return other
 
-    def before(self, rows: int, cols: int, voxel_mm: float) -> Descent:
-        """Another descent from the present state, before a detector of other pixels, with the lengths of its voxels."""
-        lengths = {"_voxel": voxel_mm, "_limits": (_LIMITS[0] * voxel_mm, _LIMITS[1] * voxel_mm)}
-        return Descent.from_state(self.state() | {"_rows": rows, "_cols": cols} | lengths)
+    def on_detector(self, rows: int, cols: int, voxel_mm: float, scale_limits: tuple[float, float]) -> Descent:
+        """Another descent from the present state, on images of other pixels and with the lengths of other voxels."""
+        other = self.branch(self._steps, self._rates, self._huber)
+        other._rows, other._cols, other._voxel, other._limits = rows, cols, voxel_mm, scale_limits
+        other.renderer = _native.Renderer32(rows, cols, self.threads)
+        return other
 
     def state(self) -> dict[str, Any]:
         """All that `from_state` needs to go on with the same bits."""

@@ -13,6 +13,7 @@ from splatcore.splats import Floats
 
 _FEWEST_PIXELS = 24  # a side of a level's detector that is shorter than this is no longer binned
 _FACTORS = (8, 4, 2, 1)
+_THINNEST, _WIDEST = 0.3, 20.0  # standard deviations of a splat, voxels
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,12 @@ class Level:
     def voxel_mm(self) -> float:
         """Edge of a cube (one slice of voxels: of a square) as large as the grid's voxel."""
         return self.grid.edge_mm
+
+    @property
+    def scale_limits(self) -> tuple[float, float]:
+        """The smallest and largest standard deviation of a splat, mm: voxels do not show what is thinner."""
+        sides = [side for side, count in zip(self.grid.voxel_mm, self.grid.shape, strict=True) if count > 1]
+        return _THINNEST * min(sides or self.grid.voxel_mm), _WIDEST * self.voxel_mm
 
     @property
     def pixel_at_isocentre_mm(self) -> float:

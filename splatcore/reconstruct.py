@@ -42,7 +42,7 @@ from splatcore.pyramid import Level, coarser, level
 from splatcore.reconstruction import Reconstruction
 from splatcore.refine import Book, Weighing, refine, weigh
 from splatcore.scan import Scan
-from splatcore.schedule import Clock, Schedule, Stage
+from splatcore.schedule import FINE_VOXELS, Clock, Schedule, Stage
 from splatcore.splats import Splats
 from splatcore.start import first_splats
 from splatcore.static import Static
@@ -52,7 +52,6 @@ _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at mo
 _WORTH_THREADS = 4_000  # splats
 _JOINT = Rates(end=0.02)  # at the finest level: as long as splats move, poses wander with them
 _MOST_SHOWN = 256**3  # voxels of a draft: more take seconds to make and to write
-_WEIGHED_VOXELS = 1.5 * 128**3  # more say the same about smoothness as half the resolution does, in ten times the time
 _FAINTEST = 1e-30  # line integral; single precision has no room for the squares of less
 
 # What a checkpoint may hold beside plain values and arrays.
@@ -270,14 +269,15 @@ class _Run:
         splats, unit = first_splats(here.images, frames, here.grid, work.splats, self._rng, self._threads)
         if self._descent is not None and here.factor == self._schedule.finest:
             grid = coarser(self._scan.volume, 2 * here.factor)  # of the level above
-            splats = aligned(splats, self._descent.splats.voxelize(grid, self._threads), grid)
+            above = self._descent.splats.voxelize(grid, self._threads)
+            splats = aligned(splats, above, grid, here.scale_limits[0])
         # A level this small is done before a second thread is awake.
         threads = self._threads if len(splats) >= _WORTH_THREADS else 1
         return Descent(
             splats, here.nominal.rows, here.nominal.cols, voxel_mm=here.voxel_mm,
             density_unit=unit, steps=work.steps, rates=rates, huber=1e-4 * top,
             dssim=self._options.dssim, data_range=top, threads=threads,
-            plane=common_plane(frames),
+            scale_limits=here.scale_limits, plane=common_plane(frames),
         )  # fmt: skip
 
     def _gate(self, stage: Stage, here: Level) -> Generator[Progress, None, None]:
@@ -323,9 +323,10 @@ class _Run:
         self._calibration.normals = self._calibration.accumulate(here, self._descent)
 
     def _weighed_at(self, stage: Stage) -> tuple[Level, Frames, int]:
-        """The level at which the last stage finds out how smooth the object is, its frames, and its splats."""
+        """The level at which the last stage finds out how smooth the object is, its frames, and its splats. Fine voxels
+        say the same about it as coarser ones, in ten times the time."""
         factor = stage.factor
-        while self._scan.volume.voxels > factor**3 * _WEIGHED_VOXELS and factor < self._schedule.coarsest:
+        while self._scan.volume.voxels > factor**3 * FINE_VOXELS and factor < self._schedule.coarsest:
             factor *= 2
         here = self._calibration.steady(level(self._scan, factor))
         return here, self._calibration.corrected(here.nominal), self._schedule.work(Stage("level", factor)).splats
@@ -345,7 +346,7 @@ class _Run:
         descent = self._descent
         assert descent is not None  # a run is not interrupted before its first volume
         if not whole:  # at full resolution, though the splats are those of a coarser one
-            descent = descent.before(here.nominal.rows, here.nominal.cols, here.voxel_mm)
+            descent = descent.on_detector(here.nominal.rows, here.nominal.cols, here.voxel_mm, here.scale_limits)
             calibration.normals = calibration.accumulate(here, descent)
         assert calibration.normals is not None
         result = conclude(

@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 
 from splatcore.descent import Descent, Rates, require_finite
+from splatcore.errors import ReconstructionError
 from splatcore.geometry import Frames
 from splatcore.lowpass import NORMAL
 from splatcore.pyramid import Level, coarser
+from splatcore.redundancy import orbit
 from splatcore.splats import Floats
 from splatcore.start import first_splats
 from splatcore.structure import aligned
@@ -32,9 +34,9 @@ _TRIAL_RATES = 0.3  # at which a branch begins, of those at the beginning of a l
 _NOISIER = 2**0.5  # half as many views: so much more noise, and as much more variation to take it away
 _PLAIN = 0.5  # of the stage's steps, where the images hold enough to go on without a prior: more follow the noise
 _EVERY = 2  # steps of Adam to one of the variation, which is twice as strong then
-_BOX = 4  # boxes of the variation along an edge: at every resolution each place is visited as often
+_BOXES = 4  # of the variation along an edge: in a fine volume each place is visited as often as in a coarse one
 _HIGH = 0.9  # rates, of those at the beginning of a level, to which splats rise again
-_SETTLING = Rates(end=0.15)
+_HALF_RATES = Rates(end=0.15)
 _CORNER = 1.345  # standard deviations: Huber's corner that is 95 % efficient on normal noise (Huber 1964)
 
 
@@ -50,7 +52,7 @@ class Weighing:
     def finding(self) -> dict[str, Any]:
         """For the report (`splatcore.report`)."""
         if not self.apart:
-            text = f"Total variation counted with weight {self.weight:g}; too few views to choose it."
+            text = f"Total variation counted with weight {self.weight:g}; too few views showed enough to choose it."
         else:
             plain, best = self.apart[0][1], dict(self.apart)[self.weight]
             gain = f"{1 - best / plain:.1%} nearer by it" if self.weight else "no nearer with more"
@@ -70,7 +72,7 @@ class Refinement:
     def __init__(self, descent: Descent, here: Level, views: Indices, weight: float, rng: np.random.Generator) -> None:
         """descent: whose splats are moved; views: indices of those to draw."""
         self.descent, self._here, self._views, self._rng = descent, here, views, rng
-        half, box = float(here.grid.half_extent_mm().max()), max(BOX, max(here.grid.shape) // _BOX)
+        half, box = float(here.grid.half_extent_mm().max()), max(BOX, max(here.grid.shape) // _BOXES)
         self._variation = Variation(here.grid, _EVERY * weight * half, descent.threads, box) if weight else None
         self.step = 0
         self._order: list[int] = []  # views still to be drawn in this epoch
@@ -135,15 +137,16 @@ def weigh(
     """The weight of the variation under which one half of the views comes nearest to the volume of the other half,
     found with so many splats at a level that may be coarser than the descent's. Yields losses.
 
-    Each half's volume is begun anew, so that they have no noise in common. Then short branches, one for each weight,
-    come to rest. The other half's volume, made without variation, is as wrong as its own noise and streaks make it,
-    whatever the weight here; so what is nearest to it is nearest to the truth. Where no weight brings a volume
-    nearer, the same is asked of going on."""
+    Each half's volume is begun anew, so that they have hardly any noise in common. Then short branches, one for each
+    weight, come to rest. The other half's volume, made without variation, is as wrong as its own noise and streaks
+    make it, whatever the weight here; so what is nearest to it is nearest to the truth. Where no weight brings a
+    volume nearer, the same is asked of going on."""
     if len(frames) < _FEWEST_VIEWS:
         return Weighing(_UNSEEN_WEIGHT, descent)
-    known = descent.before(here.nominal.rows, here.nominal.cols, here.voxel_mm)
+    known = descent.on_detector(here.nominal.rows, here.nominal.cols, here.voxel_mm, here.scale_limits)
     corner = _noise(known, here, frames)
-    halves = [np.arange(first, len(frames), 2) for first in (0, 1)]
+    order = np.argsort(orbit(frames).angle, kind="stable")  # as they are listed, halves might be arcs
+    halves = [order[first::2] for first in (0, 1)]
     grid = coarser(here.grid, 2)  # every eighth voxel is enough to tell
 
     def run(branch: Descent, half: int, steps: int, weight: float) -> Generator[float, None, Descent]:
@@ -154,15 +157,20 @@ def weigh(
     def rest(starts: Sequence[Descent], weight: float) -> Generator[float, None, list[Floats]]:
         volumes = []
         for half, start in enumerate(starts):
-            branch = start.branch(_TRIAL_STEPS, _SETTLING.times(_TRIAL_RATES), corner)
+            branch = start.branch(_TRIAL_STEPS, _HALF_RATES.times(_TRIAL_RATES), corner)
             branch = yield from run(branch, half, _TRIAL_STEPS, _NOISIER * weight)
             volumes.append(branch.splats.voxelize(grid, descent.threads))
         return volumes
 
-    anew = []
-    for half, views in enumerate(halves):
-        branch = _begun_anew(known, here, frames, views, splats, corner, np.random.default_rng([seed, half]))
-        anew.append((yield from run(branch, half, _HALF_STEPS, 0.0)))
+    try:
+        anew = [
+            _begun_anew(known, here, frames, views, splats, corner, np.random.default_rng([seed, half]))
+            for half, views in enumerate(halves)
+        ]
+    except ReconstructionError:  # every second image may be empty
+        return Weighing(_UNSEEN_WEIGHT, descent)
+    for half, branch in enumerate(anew):
+        yield from run(branch, half, _HALF_STEPS, 0.0)
     plain = yield from rest(anew, 0.0)
     found = [(0.0, _apart(plain, plain))]
     for weight in WEIGHTS[1:]:
@@ -174,7 +182,7 @@ def weigh(
         return Weighing(best, descent, True, tuple(found))
     later = []
     for half, start in enumerate(anew):
-        branch = start.branch(_HALF_STEPS, _SETTLING, corner)
+        branch = start.branch(_HALF_STEPS, _HALF_RATES, corner)
         later.append((yield from run(branch, half, _HALF_STEPS, 0.0)))
     return Weighing(best, descent, _apart((yield from rest(later, 0.0)), plain) < least, tuple(found))
 
@@ -185,8 +193,10 @@ def _begun_anew(
     """A descent from the first splats that these views alone would have given. Only shapes come from all views."""
     threads, grid = descent.threads, coarser(here.grid, 2)
     splats, _ = first_splats(here.images[views], frames[views], here.grid, count, rng, threads)
-    branch = descent.branch(_HALF_STEPS, _SETTLING, corner)
-    branch.repopulate(aligned(splats, descent.splats.voxelize(grid, threads), grid), np.full(len(splats), -1))
+    branch = descent.branch(_HALF_STEPS, _HALF_RATES, corner)
+    branch.repopulate(
+        aligned(splats, descent.splats.voxelize(grid, threads), grid, here.scale_limits[0]), np.full(len(splats), -1)
+    )
     return branch
 
 

@@ -16,7 +16,7 @@ from splatcore.scan import Scan
 _STEPS = {8: 600, 4: 750, 2: 1200, 1: 2500}
 _REFINING, _REFINING_FINE = 6000, 4500  # steps of the last stage, poses at rest; where a step takes long
 _REFINING_EPOCHS = 100  # at most
-_FINE_VOXELS = 1.5 * 128**3
+FINE_VOXELS = 1.5 * 128**3
 _MOST_EPOCHS = 200
 _QUALITY = {"preview": 1.0, "normal": 1.0, "fine": 1.5}
 _FINEST = {"preview": 2, "normal": 1, "fine": 1}
@@ -56,7 +56,7 @@ class Schedule:
             self._works[factor] = Work(steps, max(min(1_500, options.splats), int(options.splats / factor**1.5)))
         self._refining = Work(0, 0)
         if options.quality != "preview":
-            steps = _REFINING_FINE if scan.volume.voxels > _FINE_VOXELS else _REFINING
+            steps = _REFINING_FINE if scan.volume.voxels > FINE_VOXELS else _REFINING
             steps = min(steps, _REFINING_EPOCHS * len(scan.frames))
             self._refining = Work(int(steps * quality), self._works[self.finest].splats)
         self.stages = [Stage("level", factor) for factor in scales]

@@ -21,8 +21,9 @@ _FACE = 1 / 6  # rise within a standard deviation, as a share of what is dense i
 _SMOOTHED = 1.0  # voxels, before slopes are taken
 
 
-def aligned(splats: Splats, volume: Floats, grid: VolumeGrid) -> Splats:
+def aligned(splats: Splats, volume: Floats, grid: VolumeGrid, thinnest: float = 0.0) -> Splats:
     """Round splats flattened and stretched after the faces of `volume` [z, y, x] in 1/mm; each keeps its integral.
+    None gets thinner than `thinnest` mm.
 
     Of a grid that is one voxel thick they stay as they are.
     """
@@ -36,6 +37,7 @@ def aligned(splats: Splats, volume: Floats, grid: VolumeGrid) -> Splats:
     flatness = face * (most - middle) / np.maximum(most, 1e-30)  # 0: as steep along another axis
     length = face * (most - least) / np.maximum(most, 1e-30)
     stretch = np.stack([1 + (_ALONG - 1) * length, 1 + (_ALONG - 1) * flatness, 1 - (1 - _ACROSS) * flatness], axis=1)
+    stretch[:, 2] = np.maximum(stretch[:, 2], np.minimum(thinnest / splats.scales[:, 2], 1))
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation
     return replace(
         splats,

@@ -119,12 +119,24 @@ def test_interruptions_of_a_preview(scan: Scan, tmp_path: Path) -> None:
 
 
 # Shares of a run: in the coarsest level, in the finest before and after its first sweep, while the weight of the
-# variation is chosen (splats that forget, then branches), in the last stage.
+# variation is chosen (two halves, then branches of them), in the last stage.
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.35, 0.47, 0.55, 0.7, 0.8, 0.9, 0.99])
 def test_one_interruption(scan: Scan, whole: tuple[list[bytes], int], share: float, tmp_path: Path) -> None:
     moment = int(share * whole[1])
     assert bits(after_stops(scan, WHOLE, tmp_path / "run.checkpoint", [moment])) == whole[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.5, 0.6])
+def test_an_interruption_while_halves_of_less_resolution_are_compared(
+    scan: Scan, share: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("splatcore.reconstruct.FINE_VOXELS", 0)
+    counter = StopAt(None, 0)
+    expected = bits(drain(reconstruct(scan, WHOLE, counter)))
+    moment = int(share * counter.moments)
+    assert bits(after_stops(scan, WHOLE, tmp_path / "run.checkpoint", [moment])) == expected
 
 
 @pytest.mark.slow

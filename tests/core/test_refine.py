@@ -211,9 +211,26 @@ def test_a_population_that_is_all_new_begins_like_a_first_one(tmp_path):
 
 
 @pytest.mark.parametrize(("edge", "box"), [(32, 32), (128, 32), (256, 64)])
-def test_every_place_is_visited_as_often_at_every_resolution(tmp_path, edge, box):
+def test_the_box_of_the_variation_grows_with_the_volume(tmp_path, edge, box):
     scan = scan_of(sharp(), tmp_path)
     here = level(scan, 1)
     fine = replace(here, grid=VolumeGrid((edge,) * 3, here.grid.voxel_mm, here.grid.center_mm))
     refinement = Refinement(descent_of(scan), fine, np.arange(4), 0.02, np.random.default_rng(0))
     assert refinement._variation is not None and refinement._variation.box == box
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spoiled", ["order", "every second empty"])
+def test_halves_are_sound_whatever_the_order_of_the_views(tmp_path, spoiled):
+    """Views listed so that every second one lies on one side would make halves of two arcs; a half of empty images
+    cannot be chosen by."""
+    scan = scan_of(sharp(), tmp_path)
+    if spoiled == "order":
+        mixed = np.arange(30).reshape(2, 15).T.ravel()  # 0, 15, 1, 16, ...
+        scan = replace(scan, projections=scan.projections[mixed], frames=scan.frames[mixed])
+        assert weighing(drain(reconstruct(scan, FIXED)))["weight"] > 0
+    else:
+        projections = scan.projections.copy()
+        projections[1::2] = 0
+        evidence = weighing(drain(reconstruct(replace(scan, projections=projections), FIXED)))
+        assert evidence["weight"] == 0.02 and "apart_at_0" not in evidence
