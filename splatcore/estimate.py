@@ -44,7 +44,7 @@ def estimate(views: int, rows: int, cols: int, shape: Sequence[int], options: Op
     state = 4 * _PARAMETERS * _STATES * splats
     memory = 400e6 + 4 * (3 * pixels + 4 * voxels) + max(0, state - 50e6)
     if options.method == "splatct":
-        seconds = 85 * (pixels / (75 * 256**2)) ** 0.85 * max(1.0, voxels / max(pixels, 1)) ** 0.5
+        seconds = 95 * (pixels / (75 * 256**2)) ** 0.85 * max(1.0, voxels / max(pixels, 1)) ** 0.5
         seconds *= _OF_NORMAL[options.quality] * _OF_FULL[options.calibrate]
         seconds *= max(1.0, splats / default_splats(voxels)) ** 0.7
     else:

@@ -50,6 +50,7 @@ from splatcore.structure import aligned
 
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
 _WORTH_THREADS = 4_000  # splats
+_COARSE = Rates(mean=0.05, log_scale=0.01, quat=0.01)  # shapes that give way easily let the object be strained
 _JOINT = Rates(end=0.02)  # at the finest level: as long as splats move, poses wander with them
 _MOST_SHOWN = 256**3  # voxels of a draft: more take seconds to make and to write
 _FAINTEST = 1e-30  # line integral; single precision has no room for the squares of less
@@ -211,7 +212,7 @@ class _Run:
         drifting = self._options.exposure and (here.factor > finest or self._schedule.levels == 1)
         measured, here = here.images, calibration.steady(here)
         if not self._under_way:
-            self._descent = self._start(stage, here, _JOINT if last else Rates())
+            self._descent = self._start(stage, here, _JOINT if last else _COARSE)
             self._under_way = {"step": 0, "order": [], "loss": 0.0}
             yield self.progress(
                 "level", f"binning {here.factor}: {len(self._descent.splats)} splats", level=here.factor,
