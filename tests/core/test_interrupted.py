@@ -227,11 +227,11 @@ def test_a_cut_file_starts_afresh(scan: Scan, kept: Path, left: float) -> None:
 
 def test_a_newer_format_starts_afresh(scan: Scan, kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr("splatcore.checkpoint.VERSION", 2)
+        patch.setattr("splatcore.checkpoint.VERSION", 3)
         kept.unlink()
         with pytest.raises(Stopped):
             drain(reconstruct(scan, PREVIEW, StopAt(kept, 50)))
-    assert "version 2, expected 1" in resumed(scan, kept)
+    assert "version 3, expected 2" in resumed(scan, kept)
 
 
 def test_no_code_is_run_from_a_file(scan: Scan, kept: Path) -> None:
@@ -252,6 +252,7 @@ def test_a_state_that_cannot_be_written_ends_no_run(scan: Scan, tmp_path: Path) 
     assert troubles and "cannot be written" in troubles[0] and "No such file" in troubles[0]
 
 
+@pytest.mark.slow
 def test_the_volume_is_shown_as_it_stands(scan: Scan, watched: Watched) -> None:
     drafts = [event for event in watched.told if event.draft]
     assert [event.level for event in drafts] == [2, 1]
@@ -281,6 +282,7 @@ def test_writing_costs_less_than_a_hundredth() -> None:
     assert 2.0 * len(written) / now[0] < 0.0101
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "share", [0.2, pytest.param(0.6, marks=pytest.mark.slow), pytest.param(0.95, marks=pytest.mark.slow)]
 )

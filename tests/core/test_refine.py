@@ -81,6 +81,7 @@ def test_a_weight_that_does_harm_is_refused(sharp_result, monkeypatch):
     assert "apart_at_10" not in evidence  # not asked for more once less had lost
 
 
+@pytest.mark.slow
 def test_the_choice_is_the_better_volume(sharp_result, monkeypatch):
     scan, chosen, _ = sharp_result
     monkeypatch.setattr("splatcore.refine.WEIGHTS", (0.0,))
@@ -89,9 +90,10 @@ def test_the_choice_is_the_better_volume(sharp_result, monkeypatch):
     assert psnr(chosen.volume, truth, 0.01) > psnr(plain.volume, truth, 0.01) + 0.5
 
 
-def test_a_loss_that_is_no_number_ends_the_last_stage(sharp_result, monkeypatch):
+def test_a_loss_that_is_no_number_ends_the_last_stage(tmp_path, monkeypatch):
     """As it does the levels before."""
-    descent, here = descent_of(sharp_result[0]), level(sharp_result[0], 1)
+    scan = scan_of(sharp(), tmp_path)
+    descent, here = descent_of(scan), level(scan, 1)
     branch = Refinement(descent, here, np.arange(4), 0.0, np.random.default_rng(0))
     measure, calls = Descent.differentiate, []
 
@@ -104,6 +106,7 @@ def test_a_loss_that_is_no_number_ends_the_last_stage(sharp_result, monkeypatch)
         list(branch.run(here.nominal, 20))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("freedom", ["gate", "option"])
 def test_no_sigma_is_stated_where_no_view_was_moved(sharp_result, freedom):
     """Whether the option said so, or views left out did."""
@@ -127,6 +130,7 @@ def test_the_last_stage_moves_no_view(tmp_path):
     assert any(event.moved_deg is not None for event in events)
 
 
+@pytest.mark.slow
 def test_progress_grows_through_it(sharp_result):
     fractions = [event.fraction for event in sharp_result[2] if event.stage == "refine"]
     assert fractions == sorted(fractions) and fractions[-1] > fractions[0] + 0.2
@@ -184,6 +188,7 @@ def test_where_the_images_hold_no_more_the_volume_stays(tmp_path):
         assert refine(Weighing(weight, trunk, further), here, here.nominal, 3000, rng)[1] == steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "further"), [({"noise": "none", "views": 60}, True), ({"i0": 1000.0, "views": 24}, False)]
 )
