@@ -20,7 +20,7 @@ DRAFT = VolumeGrid((2, 3, 4), (1.0, 1.0, 1.0))
 def reconstruct(plan: dict[str, Any], options: Options, keeper: Keeper) -> Generator[Progress, None, dict[str, Any]]:
     print("a stray print must not disturb the events")
     print(f"environment: {' '.join(sorted(os.environ))}", file=sys.stderr, flush=True)
-    about = {"format": "splatct-checkpoint", "version": 1, "software": "fake", "scan": plan, "options": {}}
+    about = {"format": "splatct-checkpoint", "version": 2, "software": "fake", "scan": plan, "options": {}}
     state, word = keeper.recall(lambda: about, ())
     first = 0 if state is None else state["step"]
     yield Progress("start", 0.0, word or "At work")
