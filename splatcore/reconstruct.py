@@ -325,7 +325,7 @@ class _Run:
 
     def _weighed_at(self, stage: Stage) -> tuple[Level, Frames, int]:
         """The level at which the last stage finds out how smooth the object is, its frames, and its splats. Fine voxels
-        say the same about it as coarser ones, in ten times the time."""
+        say the same about it as coarser ones, in three times the time."""
         factor = stage.factor
         while self._scan.volume.voxels > factor**3 * FINE_VOXELS and factor < self._schedule.coarsest:
             factor *= 2

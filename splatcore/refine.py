@@ -23,12 +23,11 @@ from splatcore.redundancy import orbit
 from splatcore.splats import Floats
 from splatcore.start import first_splats
 from splatcore.structure import aligned
-from splatcore.trial import Indices
+from splatcore.trial import FEWEST_VIEWS, Indices
 from splatcore.variation import BOX, Variation
 
 WEIGHTS = (0.0, 0.02, 0.05)  # of the total variation beside the mean loss; each is tried if the one before won
 _UNSEEN_WEIGHT = 0.02  # where there are too few views to choose: so few need a prior
-_FEWEST_VIEWS = 16
 _HALF_STEPS, _TRIAL_STEPS = 1000, 400  # of a volume of half the views, and of each branch of it
 _TRIAL_RATES = 0.3  # at which a branch begins, of those at the beginning of a level
 _NOISIER = 2**0.5  # half as many views: so much more noise, and as much more variation to take it away
@@ -141,7 +140,7 @@ def weigh(
     weight, come to rest. The other half's volume, made without variation, is as wrong as its own noise and streaks
     make it, whatever the weight here; so what is nearest to it is nearest to the truth. Where no weight brings a
     volume nearer, the same is asked of going on."""
-    if len(frames) < _FEWEST_VIEWS:
+    if len(frames) < FEWEST_VIEWS:
         return Weighing(_UNSEEN_WEIGHT, descent)
     known = descent.on_detector(here.nominal.rows, here.nominal.cols, here.voxel_mm, here.scale_limits)
     corner = _noise(known, here, frames)

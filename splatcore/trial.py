@@ -16,14 +16,14 @@ Indices = NDArray[np.int64]
 
 _STEPS = 500
 _SPLATS = 8_000
-_FEWEST_VIEWS = 16  # with fewer, views left out are missed more than they tell
+FEWEST_VIEWS = 16  # with fewer, views left out are missed more than they tell
 _FEWEST_HELD_OUT, _SHARE = 4, 1 / 8
 
 
 def held_out_views(views: int) -> Indices:
     """Indices of the views that take no part in a trial: an eighth, at least four, evenly spread; none of a scan of
     fewer than 16 views."""
-    if views < _FEWEST_VIEWS:
+    if views < FEWEST_VIEWS:
         return np.zeros(0, np.int64)
     count = max(_FEWEST_HELD_OUT, int(views * _SHARE))
     return np.asarray((np.arange(count) + 0.5) * views / count, np.int64)

@@ -283,9 +283,7 @@ def test_writing_costs_less_than_a_hundredth() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "share", [0.2, pytest.param(0.6, marks=pytest.mark.slow), pytest.param(0.95, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("share", [0.2, 0.6, 0.95])
 def test_a_run_may_end_with_what_it_has(
     scan: Scan, whole: tuple[list[bytes], int], share: float, tmp_path: Path
 ) -> None:
