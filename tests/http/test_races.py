@@ -17,9 +17,11 @@ from redis import Redis
 from rq import Queue
 from rq.serializers import JSONSerializer
 
+from splatcore.estimate import estimate
+from splatcore.options import Options
 from worker.contract import QUEUE, TASK, queue_id
 
-from .stack import Stack, commit, kill, scan_files, submit
+from .stack import SCAN, Stack, commit, kill, scan_files, submit
 
 FILES = scan_files()
 SIZE = sum(map(len, FILES.values()))
@@ -164,14 +166,15 @@ def test_of_several_workers_one_runs_a_job_that_the_queue_names_many_times(stack
 def test_at_the_edge_of_a_quota_none_is_ever_over_it(tmp_path: Path) -> None:
     """Uploads that begin whole, that grow and that go; jobs of every kind of submission, and cancelled ones. The bytes
     are enough for three jobs, or for an upload less with each."""
-    stack, most_jobs, job_bytes = Stack(tmp_path), 3, 4_506_048
+    stack, most_jobs = Stack(tmp_path), 3
+    job_bytes = estimate(12, 16, 16, SCAN["volume"]["shape"], Options()).disk_bytes
     limit = round(3.5 * job_bytes)
     stack.environment |= {"SPLATCT_TENANT_GIB": str(limit / (1 << 30)), "SPLATCT_TENANT_JOBS": str(most_jobs)}
     stack.environment |= {"SPLATCT_RATE_PER_S": "0"}
     with stack:
         scan_id = commit(stack.http, FILES)
-        estimate = stack.http.post("/v1/jobs/validate", json={"scan_id": scan_id}).raise_for_status().json()
-        assert estimate["disk_bytes"] == job_bytes
+        cost = stack.http.post("/v1/jobs/validate", json={"scan_id": scan_id}).raise_for_status().json()
+        assert cost["disk_bytes"] == job_bytes
         listed = [{"name": "scan.json", "size": 1000}, {"name": "projections.tif", "size": round(0.8 * job_bytes)}]
         began, over, taken = time.monotonic(), [], {"upload": 0, "grown": 0, "job": 0}
 
