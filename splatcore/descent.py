@@ -99,9 +99,11 @@ class Descent:
         self.gradient = splats.zeros_like()
         self.replace(splats)
 
-    def branch(self, steps: int, rates: Rates, huber: float) -> Descent:
-        """Another descent from the present state, with a copy of the moments. The rates fall over `steps`."""
+    def branch(self, steps: int, rates: Rates, huber: float, dssim: float = 0.0) -> Descent:
+        """Another descent from the present state, with a copy of the moments. The rates fall over `steps`.
+        dssim: the least weight of D-SSIM."""
         other = copy.copy(self)
+        other._dssim = max(self._dssim, dssim)
         other._steps, other._rates, other._huber, other._count = max(steps, 1), rates, huber, 0
         other._first, other._second = self._first.copy(), self._second.copy()
         other.gradient = self.splats.zeros_like()

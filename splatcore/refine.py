@@ -1,9 +1,10 @@
 """The last stage of a reconstruction: the poses rest, the volume is refined alone.
 
 While poses move, the splats must follow the images and nothing else: a prior on the volume would bend the poses to
-it. Once they rest, the rates rise again and two things change. The loss becomes quadratic within the noise, which
-averages noise better than L1 does. And the volume may be asked for little total variation: an object of few sharp
-materials gains decibels by it, a smooth one loses. Two volumes, of half the views each, say which it is.
+it. Once they rest, the rates rise again and three things change. The loss becomes quadratic within the noise, which
+averages noise better than L1 does. A little of D-SSIM joins it, which sees the residual without its slow part and so
+pulls harder at what backprojection blurs. And the volume may be asked for little total variation: an object of few
+sharp materials gains decibels by it, a smooth one loses. Two volumes, of half the views each, say which it is.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from splatcore.geometry import Frames
 from splatcore.lowpass import NORMAL
 from splatcore.pyramid import Level, coarser
 from splatcore.redundancy import orbit
+from splatcore.schedule import FINE_VOXELS
 from splatcore.splats import Floats
 from splatcore.start import first_splats
 from splatcore.structure import aligned
@@ -36,7 +38,10 @@ _EVERY = 2  # steps of Adam to one of the variation, which is twice as strong th
 _BOXES = 4  # of the variation along an edge: in a fine volume each place is visited as often as in a coarse one
 _HIGH = 0.9  # rates, of those at the beginning of a level, to which splats rise again
 _HALF_RATES = Rates(end=0.15)
+_END, _END_FINE = 0.05, 0.1  # times that they fall; less where the steps are too few for so much rest
 _CORNER = 1.345  # standard deviations: Huber's corner that is 95 % efficient on normal noise (Huber 1964)
+_WIDE = 2.0  # times that, where nothing but noise is left to be robust against
+_LIKENESS = 0.07  # D-SSIM beside the mean loss as a share of the largest line integral
 
 
 @dataclass(frozen=True)
@@ -211,7 +216,10 @@ def refine(
     """The refinement with all views, yet to be run, and its number of steps: `steps` at most."""
     if not weighing.weight:
         steps = int(_PLAIN * steps) if weighing.further else 0
-    branch = weighing.start.branch(steps, Rates().times(_HIGH), _noise(weighing.start, here, frames))
+    top = float(here.images.max())
+    rates = Rates(end=_END_FINE if here.grid.voxels > FINE_VOXELS else _END).times(_HIGH)
+    corner = _WIDE * _noise(weighing.start, here, frames)
+    branch = weighing.start.branch(steps, rates, corner, _LIKENESS * top / (1 + _LIKENESS * top))
     return Refinement(branch, here, np.arange(len(frames)), weighing.weight, rng), steps
 
 
