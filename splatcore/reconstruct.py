@@ -267,11 +267,12 @@ class _Run:
         elif here.factor <= 2:
             calibration.settle_yaw()
         frames = calibration.corrected(here.nominal)
-        splats, unit = first_splats(here.images, frames, here.grid, work.splats, self._rng, self._threads)
-        if self._descent is not None and here.factor == self._schedule.finest:
+        known = self._descent.splats if self._descent is not None and here.factor == self._schedule.finest else None
+        above = None if known is None else known.voxelize(here.grid, self._threads)
+        splats, unit = first_splats(here.images, frames, here.grid, work.splats, self._rng, self._threads, above)
+        if known is not None:
             grid = coarser(self._scan.volume, 2 * here.factor)  # of the level above
-            above = self._descent.splats.voxelize(grid, self._threads)
-            splats = aligned(splats, above, grid, here.scale_limits[0])
+            splats = aligned(splats, known.voxelize(grid, self._threads), grid, here.scale_limits[0])
         # A level this small is done before a second thread is awake.
         threads = self._threads if len(splats) >= _WORTH_THREADS else 1
         return Descent(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from splatcore import _native
@@ -18,6 +19,9 @@ _SHARE_OF_END = 50  # the level at the end of a row is the mean over this part o
 _ABOVE_AIR, _ENOUGH = 0.05, 0.02  # of the largest line integral; share of a row's end that must exceed it
 _COUNTS = 0.1  # of a view's largest ray weight
 _SEEN = 0.9  # of all directions
+_SIGMA = 0.55  # of a splat, of the edge of the cube that it stands for
+_EMPTY = 0.01  # of the 99.9th percentile of the level above: what is more is solid
+_SPARSE = 2.0  # times the lattice's pitch elsewhere
 
 
 def fdk(projections: Floats, frames: Frames, grid: VolumeGrid, threads: int, hann: float = 1.0) -> Floats:
@@ -95,18 +99,29 @@ def _ramp(length: int, pitch: float) -> Array:
 
 
 def first_splats(
-    images: Floats, frames: Frames, grid: VolumeGrid, count: int, rng: np.random.Generator, threads: int
+    images: Floats,
+    frames: Frames,
+    grid: VolumeGrid,
+    count: int,
+    rng: np.random.Generator,
+    threads: int,
+    above: Floats | None = None,
 ) -> tuple[Splats, float]:
     """(about `count` splats of an FDK volume, the density 1/mm that is typical of what is dense in it).
+
+    above [z, y, x]: the volume of a coarser level, in this grid's voxels. It knows better where the object is.
 
     Where rows are cut off inside the object, nothing is put where views cannot see all round: what FDK finds there
     is smeared over the whole corner, and splats that start with it hold density back from the inside. The splats at
     the rim reach out for what is missing by themselves."""
     volume = fdk(images, frames, grid, threads)
+    solid = None if above is None else ndimage.binary_dilation(above > _EMPTY * np.percentile(above, 99.9))
     if cut_off(images, frames):
-        kept = np.where(coverage(frames, grid) >= _SEEN, volume, 0)
-        volume = kept if np.percentile(kept, 99.9) > 0 else volume  # nothing may be seen all round
-    return splats_from_volume(volume, grid, count, rng), float(np.percentile(volume, 99.9))
+        seen = coverage(frames, grid) >= _SEEN
+        kept = np.where(seen, volume, 0)
+        if np.percentile(kept, 99.9) > 0:  # nothing may be seen all round
+            volume, solid = kept, None if solid is None else solid & seen
+    return splats_from_volume(volume, grid, count, rng, solid=solid), float(np.percentile(volume, 99.9))
 
 
 def cut_off(images: Floats, frames: Frames) -> bool:
@@ -123,12 +138,19 @@ def cut_off(images: Floats, frames: Frames) -> bool:
 
 
 def splats_from_volume(
-    volume: Floats, grid: VolumeGrid, count: int, rng: np.random.Generator, threshold: float = 0.05
+    volume: Floats,
+    grid: VolumeGrid,
+    count: int,
+    rng: np.random.Generator,
+    threshold: float = 0.05,
+    solid: NDArray[np.bool_] | None = None,
 ) -> Splats:
     """About `count` splats, round in voxels, on a body-centred lattice wherever the volume is not empty.
 
     threshold: empty is below this share of the volume's 99.9th percentile. The lattice is as fine as it
     can be within `count`, but no finer than the voxels; positions are jittered by a tenth of its pitch.
+    solid [z, y, x]: where the object is known to be, whatever the volume shows. What it shows elsewhere is noise and
+    streaks; the lattice is twice as coarse there.
     """
     top = float(np.percentile(volume, 99.9))
     if not top > 0:
@@ -137,23 +159,31 @@ def splats_from_volume(
             "volume; try a larger volume, or check the sign and kind of the projections"
         )
     level = threshold * top
-    occupied = int(np.count_nonzero(volume > level))
     spread = np.array(volume.shape) > 1  # the axes along which there is a lattice; a single slice has one layer
     dimensions = max(int(spread.sum()), 1)
     finest = 2 ** (1 / dimensions)
+    occupied = float(np.count_nonzero(volume > level))
+    if solid is not None:
+        beyond = np.count_nonzero((volume > level) & ~solid)
+        occupied = np.count_nonzero(solid) + beyond / _SPARSE**dimensions
     pitch = (2 * occupied / count) ** (1 / dimensions)  # voxels; two points a cell
     for _ in range(8):
-        pitch = max(pitch, finest)
-        points, values = _lattice(volume, pitch, level)
+        pitch = max(float(pitch), finest)
+        points, values, times = _lattices(volume, pitch, level, solid)
         if 0.97 * count <= len(points) <= count or (len(points) < count and pitch <= finest):
             break
         pitch *= (len(points) / (0.985 * count)) ** (1 / dimensions)
     if len(points) > count:
         keep = np.sort(rng.choice(len(points), count, replace=False))
-        points, values = points[keep], values[keep]
-    points = points + rng.uniform(-0.1, 0.1, points.shape) * pitch * spread
-    spacing = pitch / finest  # edge of the cube that each splat stands for, voxels
-    sigma = 0.55 * spacing
+        points, values, times = points[keep], values[keep], times[keep]
+    spacing = times * pitch / finest  # edge of the cube that each splat stands for, voxels
+    sigma = _SIGMA * spacing
+    sparse = times > 1
+    if sparse.any():
+        blurred = ndimage.gaussian_filter(volume, 0.8 * sigma[sparse][0] * spread)
+        values[sparse] = ndimage.map_coordinates(blurred, points[sparse].T, order=1, mode="nearest")
+    values = np.maximum(values, 2e-3 * level)
+    points = points + rng.uniform(-0.1, 0.1, points.shape) * (times * pitch)[:, None] * spread
     sharpness = (spacing / (np.sqrt(2 * np.pi) * sigma)) ** dimensions  # overlapping splats add up to the volume
     voxel = np.where(spread, grid.voxel_mm, grid.edge_mm)
     middle = (np.array(grid.shape) - 1) / 2
@@ -162,19 +192,40 @@ def splats_from_volume(
     n = len(points)
     return Splats(
         means=np.ascontiguousarray(means, np.float32),
-        scales=np.tile((sigma * voxel[::-1]).astype(np.float32), (n, 1)),
+        scales=np.ascontiguousarray(sigma[:, None] * voxel[::-1], np.float32),
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         density=(values * sharpness).astype(np.float32),
     )
 
 
-def _lattice(volume: Floats, pitch: float, level: float) -> tuple[Array, Array]:
-    """Points (z, y, x in voxel indices) of a body-centred lattice where the volume exceeds `level`, and its values."""
+def _lattices(
+    volume: Floats, pitch: float, level: float, solid: NDArray[np.bool_] | None
+) -> tuple[Array, Array, Array]:
+    """Points of a lattice where the volume exceeds `level`, or of one in what is solid and a coarser one where the
+    volume does so elsewhere; the volume's values at them, and how many times the pitch theirs is."""
+    points, values = _lattice(volume, pitch)
+    if solid is None:
+        kept = values > level
+        return points[kept], values[kept], np.ones(np.count_nonzero(kept))
+    kept = _at(points, solid)
+    there, faint = _lattice(volume, _SPARSE * pitch)
+    more = (faint > level) & ~_at(there, solid)
+    times = np.repeat([1.0, _SPARSE], [np.count_nonzero(kept), np.count_nonzero(more)])
+    return np.concatenate([points[kept], there[more]]), np.concatenate([values[kept], faint[more]]), times
+
+
+def _at(points: Array, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask's values in the voxels that points [n, 3] lie in."""
+    z, y, x = np.clip(np.rint(points).astype(int), 0, np.array(mask.shape) - 1).T
+    found: NDArray[np.bool_] = mask[z, y, x]
+    return found
+
+
+def _lattice(volume: Floats, pitch: float) -> tuple[Array, Array]:
+    """Points (z, y, x in voxel indices) of a body-centred lattice, and the volume's values at them."""
     found = []
     for shift in (0.25, 0.75):
         axes = [np.arange(shift * pitch - 0.5, n - 0.5, pitch) if n > 1 else np.zeros(1) for n in volume.shape]
-        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        values = ndimage.map_coordinates(volume, points.T, order=1, mode="nearest")
-        keep = values > level
-        found.append((points[keep], values[keep]))
-    return np.concatenate([p for p, _ in found]), np.concatenate([v for _, v in found]).astype(np.float64)
+        found.append(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+    points = np.concatenate(found)
+    return points, ndimage.map_coordinates(volume, points.T, order=1, mode="nearest").astype(np.float64)

@@ -93,6 +93,25 @@ def test_first_splats_add_up_to_the_volume(count: int) -> None:
     assert again.sum() == pytest.approx(truth.sum(), rel=0.1)
 
 
+def test_where_the_object_is_known_splats_are_dense_and_elsewhere_sparse() -> None:
+    """Haze too faint for the threshold gets splats where it is known to be; streaks in air get few, large ones."""
+    truth = blobs().voxelize(GRID, 2)
+    solid = np.zeros(GRID.shape, bool)
+    solid[:, :, : GRID.shape[2] // 2] = True
+    seen = np.where(solid, 1e-3 * truth.max(), truth)  # nothing above the threshold in what is solid
+    splats = splats_from_volume(seen, GRID, 2000, np.random.default_rng(0), solid=solid)
+    assert 0.9 * 2000 <= len(splats) <= 2000
+    voxel = (splats.means[:, 0] - GRID.center_mm[0]) / GRID.voxel_mm[2] + (GRID.shape[2] - 1) / 2
+    inside = voxel < GRID.shape[2] / 2 - 1
+    beyond = voxel > GRID.shape[2] / 2 + 1
+    fine, coarse = np.median(splats.scales[inside], axis=0), np.median(splats.scales[beyond], axis=0)
+    np.testing.assert_allclose(coarse, 2 * fine, rtol=1e-5)
+    cube = (fine[0] / 0.55) ** 3 / np.prod(GRID.voxel_mm)  # voxels that each stands for
+    assert inside.sum() * cube == pytest.approx(solid.sum(), rel=0.15)
+    occupied = np.count_nonzero((seen > 0.05 * np.percentile(seen, 99.9)) & ~solid)
+    assert beyond.sum() * 8 * cube == pytest.approx(occupied, rel=0.35)
+
+
 def test_first_splats_are_no_finer_than_the_voxels() -> None:
     small = VolumeGrid((8, 8, 8), (2.0, 2.0, 2.0))
     splats = splats_from_volume(np.ones(small.shape, np.float32), small, 100_000, np.random.default_rng(0))
