@@ -147,7 +147,8 @@ def slice_psnr(result: Reconstruction, true: Frames) -> float:
     return float(-10 * np.log10(np.mean((volume / UNIT - phantom(EDGE)[13:14]).astype(np.float64) ** 2)))
 
 
-@pytest.mark.parametrize("beam", ["cone", pytest.param("parallel", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("beam", ["cone", "parallel"])
 def test_one_row_is_calibrated_in_its_plane(beam: Beam) -> None:
     scan, true = fan(beam)
     assert factors(scan, 1) == [4, 2, 1]

@@ -190,7 +190,7 @@ def test_no_verdict_on_the_geometry_where_the_volume_misses_the_object(tmp_path,
     assert report["summary"]["unexplained_share"] > 0.5
 
 
-@pytest.mark.parametrize("views", [1, 2, 5])
+@pytest.mark.parametrize("views", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)])
 def test_few_views_do_not_crash(tmp_path, views):
     scan = scan_of(tmp_path, Simulation(views=views, det=64, sigma_rot=0.02), edge=32)
     result = drain(reconstruct(scan, Options(quality="preview", threads=1)))
