@@ -166,6 +166,7 @@ def test_one_row_is_calibrated_in_its_plane(beam: Beam) -> None:
     assert np.isinf(result.sigma_translation_mm[:, 2]).all()
 
 
+@pytest.mark.slow
 def test_one_row_stored_as_one_column_gives_the_same() -> None:
     scan, _ = fan("cone")
     f = scan.frames
