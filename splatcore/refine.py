@@ -2,9 +2,9 @@
 
 While poses move, the splats must follow the images and nothing else: a prior on the volume would bend the poses to
 it. Once they rest, the rates rise again and three things change. The loss becomes quadratic within the noise, which
-averages noise better than L1 does. A little of D-SSIM joins it, which sees the residual without its slow part and so
-pulls harder at what backprojection blurs. And the volume may be asked for little total variation: an object of few
-sharp materials gains decibels by it, a smooth one loses. Two volumes, of half the views each, say which it is.
+averages noise better than L1 does. A little of D-SSIM joins it, which sees the residual without its slow part. And
+the volume may be asked for little total variation: an object of few sharp materials gains decibels by it, a smooth
+one loses. Two volumes, of half the views each, say which it is.
 """
 
 from __future__ import annotations
