@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.coverage import coverage, quotients
 from bench.paper import voxels
 from bench.paper.cells import Cell
 from bench.paper.rtk.remote import RTK
@@ -95,7 +96,16 @@ def _scored(job: Job, result: Reconstruction) -> dict[str, Any]:
     return {
         **scores, "seconds": result.timings["total"], "peak_mib": peak, "splats": len(result.splats),
         "needles": needle_share(result.splats), "static": result.static, "verdict": result.report.get("verdict"),
+        "coverage": _coverage(job, result),
     }  # fmt: skip
+
+
+def _coverage(job: Job, result: Reconstruction) -> dict[str, Any] | None:
+    """Shares of the aligned pose errors within one and two stated deviations; None where poses were not moved."""
+    sigma = np.deg2rad(result.sigma_rotation_deg), result.sigma_translation_mm
+    if np.isnan(sigma).any():
+        return None
+    return coverage(str(job.cell.scan.scene), quotients(read_truth(job.folder)[3], result.corrected, *sigma))
 
 
 def needle_share(splats: Splats) -> float:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from bench.coverage import COMPONENTS
 from bench.paper import published
 from bench.paper.cells import METHODS
 from bench.paper.plan import NOISES, RTK_PAIRS, STATIC
@@ -115,6 +116,22 @@ def methods(found: Found) -> str:
         shown = [number(value, digits) for value, digits in zip(means, (4, 3, 3, 0, 0), strict=True)]
         rows.append((label, *(number(p, 2) for p in psnrs), number(mean(psnrs), 2), *shown, METHODS[label].what))
     return table(head, rows) + "\n\nPSNR in dB, aligned; the columns after `mean` are means over the scenes."
+
+
+def uncertainties(found: Found) -> str:
+    """Shares of aligned pose errors within one and two of the deviations that poses.json states, per component."""
+    shares: dict[str, list[float]] = {}
+    for scan in found.scans():
+        covered = (found.scores(scan, "ours") or {}).get("coverage")
+        if covered is not None:
+            within = [[covered[key][component] for component in COMPONENTS] for key in ("within_1", "within_2")]
+            shares[_name(scan)] = [*within[0], mean(within[0]), *within[1], mean(within[1])]
+    if not shares:
+        return "None stated."
+    shares["mean"] = [mean(column) for column in zip(*shares.values(), strict=True)]
+    head = ("scene (projector)", *(f"{name}, {c}" for name in ("1σ", "2σ") for c in (*COMPONENTS, "all")))
+    rows = [(name, *(number(share, 2) for share in row)) for name, row in shares.items()]
+    return table(head, rows) + "\n\nOf normal errors 0.68 lie within 1σ and 0.95 within 2σ."
 
 
 def noise(found: Found) -> str:
@@ -249,7 +266,11 @@ def failures(found: Found) -> str:
 
 
 TABLES: dict[str, list[tuple[str, Callable[[Found], str]]]] = {
-    "headline": [("0.03 rad / 1 voxel", headline), ("All methods, 0.03 rad / 1 voxel", methods)],
+    "headline": [
+        ("0.03 rad / 1 voxel", headline),
+        ("All methods, 0.03 rad / 1 voxel", methods),
+        ("Stated uncertainties of ours", uncertainties),
+    ],
     "noise": [("From no pose error to 0.1 rad / 5 voxels", noise)],
     "views": [("Fewer views", views)],
     "right": [("Poses that were right", right)],

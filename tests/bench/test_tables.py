@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from bench.coverage import COMPONENTS
 from bench.paper import plan, tables
 from bench.paper.cells import METHODS, Cell
 from bench.paper.run import Outcome
@@ -36,6 +37,25 @@ def test_the_share_of_the_gain_is_one_for_true_frames_and_none_for_nominal_ones(
     assert tables.share_of_gain(20, 18, 30) == pytest.approx(-0.2)
     assert math.isnan(tables.share_of_gain(30, 30, 30)), "true frames that bring nothing leave nothing to share"
     assert math.isnan(tables.share_of_gain(20, math.nan, 30))
+
+
+def test_stated_uncertainties_are_averaged_over_components_and_scans() -> None:
+    def covered(share: float) -> dict[str, dict[str, float]]:
+        return {"within_1": dict.fromkeys(COMPONENTS, share) | {"rz": 0.0}, "within_2": dict.fromkeys(COMPONENTS, 1.0)}
+
+    scores = {"psnr": 38.0, "psnr_aligned": 38.0}
+    found = tables.Found(
+        [
+            Outcome(Cell(HEAD, METHODS["ours"]), {**scores, "coverage": covered(0.6)}),
+            Outcome(Cell(CHEST, METHODS["ours"]), {**scores, "coverage": covered(0.9)}),
+            Outcome(Cell(HEAD, METHODS["ceiling"]), {**scores, "coverage": None}),
+        ]
+    )
+    text = tables.uncertainties(found)
+    assert cells_of(text, "head (own)")[1:8] == ["0.60", "0.60", "0.00", "0.60", "0.60", "0.60", "0.50"]
+    assert cells_of(text, "mean")[1:8] == ["0.75", "0.75", "0.00", "0.75", "0.75", "0.75", "0.62"]
+    assert cells_of(text, "mean")[8:] == ["1.00"] * 7
+    assert tables.uncertainties(tables.Found([outcome(HEAD, "ours", 38)])) == "None stated."
 
 
 def test_means_are_of_what_is_there() -> None:
