@@ -20,6 +20,7 @@ from splatcore.poses import Normals, accumulate
 from splatcore.pyramid import Level, factors, level
 from splatcore.scan import Scan
 from splatcore.staticreport import static_findings
+from splatcore.stray import told
 from splatcore.trial import try_frames
 
 _HOLD_OUT_EVERY = 8
@@ -84,6 +85,7 @@ def diagnose(
         _held_out(options, before, after, held_out),
         *static_findings(scan, static, static_sigma, options.calibrate != "none"),
         _outliers(normals.rms),
+        _strays(scan),
         _sigma_note(options),
     ]
     return {
@@ -225,6 +227,13 @@ def _outliers(rms: Array) -> dict[str, Any]:
         "text": text,
         "evidence": {"median_rms": middle, "views": len(odd)},
     }
+
+
+def _strays(scan: Scan) -> dict[str, Any] | None:
+    if not scan.strays:
+        return None
+    text = f"{told(scan.strays)}."
+    return {"name": "stray pixels", "severity": "note", "text": text, "evidence": {"pixels": scan.strays}}
 
 
 def _sigma_note(options: Options) -> dict[str, Any] | None:

@@ -15,6 +15,7 @@ from splatcore.options import Options
 from splatcore.projections import Conversion, Image, Stacks
 from splatcore.redundancy import lopsidedness
 from splatcore.scanjson import ScanHeader
+from splatcore.stray import told
 
 _SAMPLE = 400_000  # pixels looked at for percentiles
 _FULL_TURN, _HALF_FAN = 350.0, 0.3  # degrees; share of the longer side that the shorter one lacks
@@ -187,6 +188,8 @@ def conversion_warnings(conversion: Conversion, views: int) -> list[str]:
         )
     if conversion.no_light:
         found.append(f"{conversion.no_light} pixels have no light in the flat image and are treated as bad")
+    if conversion.strays:
+        found.append(told(conversion.strays))
     bad = int(np.count_nonzero(conversion.bad))
     if bad > 0.05 * conversion.bad.size:
         found.append(f"{bad / conversion.bad.size:.0%} of the pixels are marked as bad")

@@ -1,4 +1,4 @@
-"""From stored pixels to line integrals: scale, flat and dark, logarithm, bad pixels.
+"""From stored pixels to line integrals: scale, flat and dark, logarithm, bad and stray pixels.
 
 Views are handled one at a time, so that a scan can be checked in little memory.
 """
@@ -16,6 +16,7 @@ from splatcore.document import Document
 from splatcore.errors import ScanError
 from splatcore.scanfiles import NamedFile
 from splatcore.scanjson import ScanHeader
+from splatcore.stray import mend_strays
 from splatcore.tiff import TiffHeader, read_header, read_pages
 
 Image = NDArray[np.float32]
@@ -112,6 +113,7 @@ class Conversion:
         self.clamped = 0  # pixels whose transmission was raised to the smallest meaningful one
         self.lowest_transmission = np.inf  # the value they were raised to
         self.no_light = 0  # pixels where flat <= dark, treated as bad
+        self.strays = 0  # pixels of single views that stood out alone, taken from their neighbours
         self.bad: Mask = np.zeros(shape, np.bool_)
         if stacks.bad_pixels is not None:
             self.bad = next(read_pages(stacks.bad_pixels)) != 0
@@ -168,7 +170,9 @@ class Conversion:
                     self._mend(image, stack, number)
                     image = self._integrals(image, stack, next(exposure))
                     self._mend(image, stack, number)
-                yield self._fill(image)
+                image = self._fill(image)
+                self.strays += mend_strays(image)
+                yield image
 
     def _integrals(self, image: Image, stack: TiffHeader, exposure: float) -> Image:
         """exposure: of this view, as a share of the mean over views."""

@@ -31,6 +31,7 @@ class Scan:
     volume: VolumeGrid
     time_s: tuple[float, ...] | None = None  # per view; page order is time order where None
     bad_pixels: Mask | None = None  # [rows, cols], True is bad
+    strays: int = 0  # pixels of single views that stood out alone, taken from their neighbours
     exposure: tuple[float, ...] | None = None  # per view, as given; counts and transmissions were divided by it
     tolerance: Tolerance | None = None
     simulation: dict[str, Any] | None = None  # the truth of a simulated scan, for `evaluate` alone
@@ -50,6 +51,7 @@ def read_scan(folder: Path | str) -> Scan:
         volume=header.volume or grid_from_view(header.frames),
         time_s=header.time_s,
         bad_pixels=conversion.bad if conversion.bad.any() else None,
+        strays=conversion.strays,
         exposure=header.exposure,
         tolerance=header.tolerance,
         simulation=header.simulation,
