@@ -73,6 +73,11 @@ class Descent:
         self.gradient = splats.zeros_like()  # dL/dsplats of the last `differentiate`
         self.replace(splats)
 
+    @property
+    def mean_share(self) -> float:
+        """What the mean loss counts, beside D-SSIM."""
+        return 1 - self._dssim
+
     def replace(self, splats: Splats) -> None:
         """Go on from these splats (moved by a gauge), keeping the moments."""
         self.splats = Splats(*(np.ascontiguousarray(a, np.float32).copy() for a in splats.arrays()))
@@ -106,6 +111,10 @@ class Descent:
         other._dssim = max(self._dssim, dssim)
         other._steps, other._rates, other._huber, other._count = max(steps, 1), rates, huber, 0
         other._first, other._second = self._first.copy(), self._second.copy()
+        if other._dssim > self._dssim:  # what Adam remembers are gradients of a mean loss that counted more
+            less = np.float32(other.mean_share / self.mean_share)
+            other._first *= less
+            other._second *= less**2
         other.gradient = self.splats.zeros_like()
         other.replace(self.splats)
         return other

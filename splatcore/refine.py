@@ -77,7 +77,8 @@ class Refinement:
         """descent: whose splats are moved; views: indices of those to draw."""
         self.descent, self._here, self._views, self._rng = descent, here, views, rng
         half, box = float(here.grid.half_extent_mm().max()), max(BOX, max(here.grid.shape) // _BOXES)
-        self._variation = Variation(here.grid, _EVERY * weight * half, descent.threads, box) if weight else None
+        strength = _EVERY * weight * half * descent.mean_share  # beside the mean loss, whatever else there is
+        self._variation = Variation(here.grid, strength, descent.threads, box) if weight else None
         self.step = 0
         self._order: list[int] = []  # views still to be drawn in this epoch
         self._loss, self._drawn = 0.0, 0  # of this epoch; its views

@@ -167,12 +167,13 @@ def splats_from_volume(
         beyond = np.count_nonzero((volume > level) & ~solid)
         occupied = np.count_nonzero(solid) + beyond / _SPARSE**dimensions
     pitch = (2 * occupied / count) ** (1 / dimensions)  # voxels; two points a cell
+    better = pitch
     for _ in range(8):
-        pitch = max(float(pitch), finest)
+        pitch = max(float(better), finest)
         points, values, times = _lattices(volume, pitch, level, solid)
         if 0.97 * count <= len(points) <= count or (len(points) < count and pitch <= finest):
             break
-        pitch *= (len(points) / (0.985 * count)) ** (1 / dimensions)
+        better = pitch * (len(points) / (0.985 * count)) ** (1 / dimensions)
     if len(points) > count:
         keep = np.sort(rng.choice(len(points), count, replace=False))
         points, values, times = points[keep], values[keep], times[keep]

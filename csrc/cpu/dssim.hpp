@@ -33,23 +33,25 @@ inline void convolve_row(const SsimWindow<T>& w, int y, int rows, long stride, l
 // Adds the gradient of weight * (1 - mean SSIM) / 2 to gradient_, returns the term. Image and target are both
 // multiplied by the mask first, so what a dead pixel holds does not matter. The reverse of a convolution with
 // a symmetric window is the convolution itself: five maps go forward (x, y, xx, yy, xy), three adjoints come back.
+// Maps are in units of data_range: fourth powers of a line integral, whatever its unit, leave a float's range.
 template <class T>
 double CpuRenderer<T>::dssim_loss(const T* target, const T* mask, double weight, double data_range) {
   static const SsimWindow<T> window;
   const long width = (cols_ + P::size - 1) / P::size * P::size, pitch = width + 2 * kSsimRadius;
   const size_t pixels = static_cast<size_t>(rows_) * stride_;
   T* maps = maps_.reserve(5 * pixels);
-  T *have = maps, *want = maps + pixels;  // masked, zero from column cols_ on
+  T *have = maps, *want = maps + pixels;  // masked, over the range, zero from column cols_ on
   T *v_mean = maps + 2 * pixels, *v_xx = maps + 3 * pixels, *v_xy = maps + 4 * pixels;  // adjoints
-  const P c1(T(1e-4 * data_range * data_range)), c2(T(9e-4 * data_range * data_range));
+  const T unit = T(1 / data_range);
+  const P c1(T(1e-4)), c2(T(9e-4));
   const P scale(T(-0.5 * weight / (static_cast<double>(rows_) * cols_))), zero(T(0)), two(T(2)), end{T(cols_)};
 #pragma omp parallel for num_threads(threads_) schedule(static)
   for (int y = 0; y < rows_; ++y) {
     const T *image = line(image_, y), *aim = target + static_cast<size_t>(y) * cols_;
     const T* on = mask ? mask + static_cast<size_t>(y) * cols_ : nullptr;
     T *to = have + y * stride_, *other = want + y * stride_;
-    for (int x = 0; x < cols_; ++x) to[x] = on ? on[x] * image[x] : image[x];
-    for (int x = 0; x < cols_; ++x) other[x] = on ? on[x] * aim[x] : aim[x];
+    for (int x = 0; x < cols_; ++x) to[x] = unit * (on ? on[x] * image[x] : image[x]);
+    for (int x = 0; x < cols_; ++x) other[x] = unit * (on ? on[x] * aim[x] : aim[x]);
     for (long x = cols_; x < width; ++x) to[x] = other[x] = T(0);
   }
   double* partial = partial_.reserve(rows_);
@@ -92,7 +94,7 @@ double CpuRenderer<T>::dssim_loss(const T* target, const T* mask, double weight,
       };
       convolve_row<3>(window, y, rows_, stride_, width, columns, down, across);
       const T* on = mask ? mask + static_cast<size_t>(y) * cols_ : nullptr;
-      for (int x = 0; x < cols_; ++x) out[x] += on ? on[x] * slope[x] : slope[x];
+      for (int x = 0; x < cols_; ++x) out[x] += unit * (on ? on[x] * slope[x] : slope[x]);
     }
   }
   double total = 0;

@@ -125,3 +125,23 @@ def test_images_smaller_than_the_window(shape: tuple[int, int]) -> None:
     loss = renderer.loss_vjp(view, False, *c.tensors(), target, None, HUBER, 1.0, RANGE, *gradients)
     image = ops.render(*c.tensors(), NO_MOTION, view, False, *shape)
     assert loss == pytest.approx(float((1 - mean_ssim(image, target)) / 2), rel=1e-12)
+
+
+@pytest.mark.parametrize("power", [-90, -30, 12, 40])
+def test_no_unit_of_the_line_integrals_matters(isa: str, power: int) -> None:
+    """Fourth powers of them would leave single precision."""
+    leaves, view, target, mask = scene("cone")
+    splats = [t.detach().float() for t in leaves]
+
+    def found(unit: float) -> tuple[float, list[Tensor]]:
+        scaled = [*splats[:3], splats[3] * unit]
+        gradients = [torch.empty_like(t) for t in splats]
+        loss = _native.Renderer32(ROWS, COLS, 2).loss_vjp(
+            view, True, *scaled, target.float() * unit, mask.float(), HUBER * unit, 1.0, RANGE * unit, *gradients
+        )
+        return loss, [*gradients[:3], gradients[3] * unit]
+
+    plain, other = found(1.0), found(2.0**power)
+    assert other[0] == pytest.approx(plain[0], rel=1e-6)
+    for a, e in zip(other[1], plain[1], strict=True):
+        np.testing.assert_allclose(a, e, rtol=1e-4, atol=1e-6 * float(e.abs().max()))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatcore.checkpoint import identity
+from splatcore.checkpoint import VERSION, identity
 from splatcore.grid import VolumeGrid
 from splatcore.keeper import Keeper, Stopped, Wish
 from splatcore.options import Options
@@ -227,11 +227,11 @@ def test_a_cut_file_starts_afresh(scan: Scan, kept: Path, left: float) -> None:
 
 def test_a_newer_format_starts_afresh(scan: Scan, kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr("splatcore.checkpoint.VERSION", 3)
+        patch.setattr("splatcore.checkpoint.VERSION", VERSION + 1)
         kept.unlink()
         with pytest.raises(Stopped):
             drain(reconstruct(scan, PREVIEW, StopAt(kept, 50)))
-    assert "version 3, expected 2" in resumed(scan, kept)
+    assert f"version {VERSION + 1}, expected {VERSION}" in resumed(scan, kept)
 
 
 def test_no_code_is_run_from_a_file(scan: Scan, kept: Path) -> None:

@@ -46,12 +46,12 @@ def weighing(result: Reconstruction) -> dict:
     return found[0]["evidence"]
 
 
-def descent_of(scan: Scan) -> Descent:
+def descent_of(scan: Scan, unit: float = 1.0) -> Descent:
     here = level(scan, 1)
-    splats, unit = first_splats(here.images, here.nominal, here.grid, 2000, np.random.default_rng(0), 1)
+    splats, typical = first_splats(here.images, here.nominal, here.grid, 2000, np.random.default_rng(0), 1)
     return Descent(
-        splats, 64, 64, voxel_mm=here.voxel_mm, density_unit=unit, steps=50, rates=Rates(), huber=1e-4, dssim=0.0,
-        data_range=1.0, threads=1,
+        splats, 64, 64, voxel_mm=here.voxel_mm, density_unit=typical, steps=50, rates=Rates(), huber=1e-4 * unit,
+        dssim=0.0, data_range=unit, threads=1,
     )  # fmt: skip
 
 
@@ -178,6 +178,26 @@ def test_a_branch_keeps_its_momentum(tmp_path):
     trunk.step(frame, True, here.images[0], None)
     branch.step(frame, True, here.images[0], None)
     np.testing.assert_array_equal(branch.splats.means, trunk.splats.means)
+
+
+@pytest.mark.parametrize("power", [-10, 13])
+def test_no_unit_of_the_line_integrals_matters(tmp_path, power):
+    """Mean loss, D-SSIM, variation and Adam's moments keep their proportion: the same splats, as much denser."""
+    plain = scan_of(sharp(), tmp_path)
+    moved = {}
+    for unit in (1.0, 2.0**power):
+        scan = replace(plain, projections=plain.projections * np.float32(unit))
+        here, trunk = level(scan, 1), descent_of(scan, unit)
+        packed = here.nominal.packed()
+        for view in range(10):
+            trunk.step(packed[view], True, here.images[view], None)
+        stage, steps = refine(Weighing(0.02, trunk), here, here.nominal, 60, np.random.default_rng(0))
+        list(stage.run(here.nominal, steps))
+        moved[unit] = stage.descent.splats
+    one, other = moved.values()
+    away = np.abs(one.means - other.means).max(axis=1) / here.voxel_mm
+    assert np.quantile(away, 0.99) < 0.01
+    assert np.quantile(np.abs(other.density / (one.density * unit) - 1), 0.99) < 0.01
 
 
 def test_where_the_images_hold_no_more_the_volume_stays(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from splatcore import _native
 from splatcore.errors import ReconstructionError
@@ -110,6 +111,23 @@ def test_where_the_object_is_known_splats_are_dense_and_elsewhere_sparse() -> No
     assert inside.sum() * cube == pytest.approx(solid.sum(), rel=0.15)
     occupied = np.count_nonzero((seen > 0.05 * np.percentile(seen, 99.9)) & ~solid)
     assert beyond.sum() * 8 * cube == pytest.approx(occupied, rel=0.35)
+
+
+@pytest.mark.parametrize("count", [60, 100, 150, 300, 1500])
+def test_widths_are_those_of_the_lattice_that_the_splats_stand_on(count: int) -> None:
+    """However the search for its pitch ends. Without jitter the nearest neighbour is half a cell's diagonal away."""
+
+    class Still(np.random.Generator):
+        def uniform(self, low: float, high: float, shape: tuple[int, ...]) -> np.ndarray:
+            return np.zeros(shape)
+
+    shape = (32, 32, 32)
+    distance = np.linalg.norm(np.indices(shape) - 15.5, axis=0)
+    ball = (distance < 11).astype(np.float32)
+    splats = splats_from_volume(ball, VolumeGrid(shape, (1.0, 1.0, 1.0)), count, Still(np.random.PCG64(0)))
+    away = cKDTree(splats.means).query(splats.means, k=2)[0][:, 1]
+    pitch = away.min() / (np.sqrt(3) / 2)
+    np.testing.assert_allclose(splats.scales, 0.55 * pitch / 2 ** (1 / 3), rtol=1e-4)
 
 
 def test_first_splats_are_no_finer_than_the_voxels() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -89,3 +91,23 @@ def test_left_alone_where_there_is_nothing_to_go_by(case: str) -> None:
     volume[:, 10:20] = 0.02 * (case == "one slice")
     before = round_splats(np.random.default_rng(3).uniform(-9, 9, (30, 3)))
     assert aligned(before, volume, grid) is before
+
+
+def test_a_world_stretched_with_its_voxels_gives_stretched_splats() -> None:
+    """Splats round in long voxels are shaped as those round in cubes, then stretched; none of them is turned first."""
+    cubes = VolumeGrid((30, 36, 32), (1.0, 1.0, 1.0))
+    long = VolumeGrid(cubes.shape, (4.0, 1.0, 2.0))
+    stretched = np.array([2.0, 1.0, 4.0])  # x y z
+    volume = soft(np.linalg.norm(cubes.centers_mm() - 1.5, axis=-1) - 10.0)
+    out = np.random.default_rng(4).normal(size=(100, 3))
+    before = round_splats(1.5 + 10 * out / np.linalg.norm(out, axis=1, keepdims=True))
+    means, scales = (np.asarray(a * stretched, np.float32) for a in (before.means, before.scales))
+    one, other = aligned(before, volume, cubes), aligned(replace(before, means=means, scales=scales), volume, long)
+
+    def covariance(splats: Splats) -> Array:
+        half = axes_of(splats) * splats.scales[:, None, :]
+        return np.asarray(half @ half.transpose(0, 2, 1))
+
+    expected = stretched[:, None] * covariance(one) * stretched
+    np.testing.assert_allclose(covariance(other), expected, rtol=1e-3, atol=1e-3 * SIGMA**2)
+    np.testing.assert_allclose(other.density, one.density, rtol=1e-4)
