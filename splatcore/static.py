@@ -29,9 +29,9 @@ _REACH_DEG = (3.0, 3.0, 1.0)  # longest step of roll, pitch, yaw; of cor, a sixt
 _YAW_TOLD_DEG = 0.25  # with free views a smaller yaw is not told from none at low resolution; measured errors: 0.1
 _YAW_TOLD_SIGMAS = 10.0
 # Below these (columns, degrees) a constant error at half resolution is not told from none: what was found there where
-# nothing was wrong was at most 0.002, 0.0015, 0.04 and 0.0003 at 128^3, and a yaw of 0.07 to 1.1 at 40^3:
+# nothing was wrong was at most 0.002, 0.0015, 0.051 and 0.0003 at 128^3, and a yaw of 0.07 to 1.1 at 40^3:
 # what is larger is solved on.
-_TOLD = (0.02, 0.005, 0.05, 0.1)
+_TOLD = (0.02, 0.005, 0.07, 0.1)
 _YAW_STEP = 0.01  # rad; difference of two float32 images: large enough to stand above their rounding
 
 
