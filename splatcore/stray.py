@@ -28,6 +28,8 @@ def mend_strays(image: Image) -> int:
     stride = max(1, size.size // _SAMPLE)
     stride += stride > 1 and image.shape[1] % stride == 0  # not the same columns in every row
     limit = _BEYOND * float(np.quantile(size.ravel()[::stride], _LEVEL))
+    if not limit > 0:  # no more than a speck in all the view: it is the object
+        return 0
     rows, cols = np.nonzero(size > limit)
     if not len(rows):
         return 0

@@ -91,3 +91,9 @@ def test_a_scan_is_read_without_them_and_says_so(tmp_path: Path) -> None:
 
 def test_a_real_object_in_noise_has_none() -> None:
     assert read_scan(HEAD).strays == 0
+
+
+def test_a_bead_alone_in_the_view_is_the_object() -> None:
+    image = np.zeros((40, 40), np.float32)
+    image[20, 20:22] = 0.9, 0.1
+    assert mend_strays(image) == 0
