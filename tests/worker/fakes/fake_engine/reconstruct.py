@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from splatcore.checkpoint import FORMAT, VERSION
 from splatcore.errors import ReconstructionError
 from splatcore.grid import VolumeGrid
 from splatcore.keeper import Concluding, Keeper
@@ -20,7 +21,7 @@ DRAFT = VolumeGrid((2, 3, 4), (1.0, 1.0, 1.0))
 def reconstruct(plan: dict[str, Any], options: Options, keeper: Keeper) -> Generator[Progress, None, dict[str, Any]]:
     print("a stray print must not disturb the events")
     print(f"environment: {' '.join(sorted(os.environ))}", file=sys.stderr, flush=True)
-    about = {"format": "splatct-checkpoint", "version": 2, "software": "fake", "scan": plan, "options": {}}
+    about = {"format": FORMAT, "version": VERSION, "software": "fake", "scan": plan, "options": {}}
     state, word = keeper.recall(lambda: about, ())
     first = 0 if state is None else state["step"]
     yield Progress("start", 0.0, word or "At work")
