@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.float32]
+from splatcore.splats import Floats
 
 _LEVEL, _BEYOND = 0.99, 2.0  # beyond so many times that quantile of a view's line integrals
 _ALONE = 0.5  # the second largest neighbour is below this share of it: wires, and corners of beads, have two as large
@@ -18,7 +18,7 @@ _AROUND = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
 _ALONG = np.array([-2, -1, 1, 2])  # on a detector of a single row or column
 
 
-def mend_strays(image: Image) -> int:
+def mend_strays(image: Floats) -> int:
     """Gives pixels that stand out alone the median of their neighbours, in place. Returns how many they were.
 
     image [rows, cols]: line integrals. Of pixels that touch, pairs are found; larger patches may be of the object. So
