@@ -17,6 +17,7 @@ from splatcore.gate import Decision, gate, information
 from splatcore.gauge import settle
 from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.jitter import narrowed
+from splatcore.lost import find_again, lost_views
 from splatcore.lowpass import HUBER, NORMAL, low_passed
 from splatcore.options import Options
 from splatcore.planar import unseen
@@ -228,6 +229,18 @@ class Calibration:
             "moved_deg": float(np.rad2deg(np.sqrt((omega**2).sum(axis=1).mean()))),
             "moved_mm": float(np.hypot(np.sqrt((tau**2).sum(axis=1).mean()), shift)),
         }
+
+    def find_lost(self, here: Level, descent: Descent) -> int:
+        """Look for the place of views that stand out against the others (splatcore.lost). Returns how many were found.
+
+        Only where every view moves for itself, and after a sweep."""
+        together = self._alone or (self.decision is not None and self.decision.model != "full")
+        if self.normals is None or together:
+            return 0
+        views = lost_views(self.normals)
+        scanner = replace(here, nominal=self.at(here.nominal).apply(here.nominal))
+        self.motions, found = find_again(scanner, descent, self.motions, views, self.prior)
+        return len(found)
 
     def entries(self, corrected: Frames, orientation: dict[str, bool]) -> tuple[dict[str, float], dict[str, float]]:
         """The scanner's constant errors, and the standard deviations of those that were solved."""

@@ -15,11 +15,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from splatcore.descent import Descent
 from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.lowpass import HUBER, NORMAL
+from splatcore.misfit import Fit, Misfit
 from splatcore.motionmodel import Curve, constant_motion, smooth_motion
-from splatcore.poses import Normals, Prior, accumulate
+from splatcore.poses import Normals, Prior
 from splatcore.pyramid import Level
 from splatcore.splats import Floats
 from splatcore.trial import Indices, held_out_views, try_frames
@@ -197,12 +197,12 @@ def _gains_of_freedom(
     halves = _halves(here)
     gains = []
     for view in held:
-        loss = _Loss(here, trial, int(view), prior, huber)
+        misfit = Misfit(here, trial, int(view), prior, huber)
         start = RigidMotions(prediction.rotation[view : view + 1], prediction.translation[view : view + 1])
         before, after = 0.0, 0.0
         for fitted, unseen in (halves, halves[::-1]):
-            before += loss.at(start, unseen)
-            after += loss.at(loss.freed(start, fitted), unseen)
+            before += misfit.at(start, unseen).loss
+            after += misfit.at(_freed(misfit, start, fitted).motion, unseen).loss
         gains.append(np.log(before / after))
     return np.array(gains)
 
@@ -215,34 +215,11 @@ def _halves(here: Level) -> tuple[Floats, Floats]:
     return white * good, (1 - white) * good
 
 
-class _Loss:
-    """The robust squared residual of one view against the splats of a trial, as a function of the view's pose."""
-
-    def __init__(self, here: Level, trial: Descent, view: int, prior: Prior, huber: float) -> None:
-        self._nominal, self._target = here.nominal[view : view + 1], here.images[view]
-        self._trial, self._huber, self._precision = trial, huber, np.diag(prior.precision())
-
-    def at(self, motion: RigidMotions, mask: Floats) -> float:
-        return self._normal(motion, mask)[2]
-
-    def freed(self, motion: RigidMotions, mask: Floats) -> RigidMotions:
-        """The pose after a few Gauss-Newton steps on these pixels: of all that were visited the one of least loss."""
-        best, least = motion, np.inf
-        for step in range(_STEPS + 1):
-            hessian, gradient, loss, noise = self._normal(motion, mask)
-            if loss < least:
-                best, least = motion, loss
-            if step < _STEPS:
-                system = hessian / noise + self._precision
-                system += _DAMPING * np.diag(np.diag(system))
-                offset = np.concatenate(motion.vectors(), axis=1)[0]
-                increment = -np.linalg.solve(system, gradient / noise + self._precision @ offset)[None]
-                motion = motion @ RigidMotions.exp(increment[:, :3], increment[:, 3:])
-        return best
-
-    def _normal(self, motion: RigidMotions, mask: Floats) -> tuple[Array, Array, float, float]:
-        """Normal equations [6, 6], [6]; robust squared residual; variance of a pixel."""
-        frames = motion.correct(self._nominal)
-        normals = accumulate(self._trial.renderer, self._trial.splats, frames, self._target[None], mask, self._huber)
-        loss = max(float(normals.weighted_ss[0]), 1e-30)
-        return normals.rigid[0], normals.gradient[0, :6], loss, float(normals.noise[0])
+def _freed(misfit: Misfit, motion: RigidMotions, mask: Floats) -> Fit:
+    """The view after a few Gauss-Newton steps on these pixels: of all poses that were visited that of least loss."""
+    best = fit = misfit.at(motion, mask)
+    for _ in range(_STEPS):
+        fit = misfit.at(misfit.stepped(fit, _DAMPING), mask)
+        if fit.loss < best.loss:
+            best = fit
+    return best

@@ -237,17 +237,22 @@ class _Run:
             if self._schedule.levels == 1 and 2 * step >= work.steps:
                 calibration.settle_yaw()
             moved: dict[str, float] = {}
+            found = 0
             if not calibration.fixed and step >= first_sweep:
                 moved = calibration.sweep(here, descent, finest)
+                if 2 * step >= work.steps:  # by now most views agree
+                    found = calibration.find_lost(here, descent)
                 packed = calibration.corrected(here.nominal).packed()
             if drifting and step >= first_sweep:
                 corrected = calibration.corrected(here.nominal)
                 calibration.exposure.update(descent.renderer, descent.splats, corrected, measured, here.mask)
                 here = replace(here, images=calibration.exposure.corrected(measured))
             now["loss"] = 0.0
+            also = f"; lost views found: {found}" if found else ""
             yield self.progress(
-                "poses" if moved else "level", f"binning {here.factor}, step {step} of {work.steps}", level=here.factor,
-                step=step, loss=loss / (views - len(now["order"])), splats=len(descent.splats), **moved,
+                "poses" if moved else "level", f"binning {here.factor}, step {step} of {work.steps}{also}",
+                level=here.factor, step=step, loss=loss / (views - len(now["order"])), splats=len(descent.splats),
+                **moved,
             )  # fmt: skip
             yield from self._trouble()
         if not last:

@@ -1,0 +1,78 @@
+"""Views that are lost: far from their place while the others have found theirs.
+
+A sweep moves all views a little, with the others' needs in mind. A view that began far off lags behind, and what it
+shows pulls at the volume from the wrong side. Once the others agree, it stands out: it fits much worse than they do.
+Then its six numbers alone are solved to the end, the volume held (Levenberg 1944, Marquardt 1963): from where it is,
+and if that leads nowhere from places around nominal. What was found counts if the view fits so much better that it
+must have been lost.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from splatcore.descent import Descent
+from splatcore.geometry import RigidMotions
+from splatcore.misfit import Fit, Misfit
+from splatcore.poses import Normals, Prior
+from splatcore.pyramid import Level
+from splatcore.splats import Floats
+from splatcore.trial import Indices
+
+_STANDS_OUT = 1.5  # times the median residual: by less, noise and the object's sides differ
+_FOUND = 0.75  # times its residual before: within its own minimum a view gains less
+_FARTHEST = 5.0  # standard deviations of the prior: an image of nothing fits best where the object is out of sight
+_AROUND = 2.4  # standard deviations of the prior, about each axis: where else to begin
+_STEPS = 40
+_DAMPING, _EASED, _TIGHTENED, _STUCK = 1e-3, 0.2, 6.0, 1e6
+_SETTLED = 1e-3  # share of the squared residual: a step that gains less is the last
+
+
+def lost_views(normals: Normals) -> Indices:
+    """Indices of the views whose residual stands out."""
+    return np.flatnonzero(normals.rms > _STANDS_OUT * np.median(normals.rms))
+
+
+def find_again(
+    here: Level, descent: Descent, motions: RigidMotions, views: Indices, prior: Prior
+) -> tuple[RigidMotions, Indices]:
+    """The motions with those of the views that were found, and the indices of these.
+
+    here: its nominal frames are those before any view's own motion; views: indices of those to look for."""
+    rotation, translation = motions.rotation.copy(), motions.translation.copy()
+    found = []
+    quadratic = float(np.abs(here.images).max())  # a view in the wrong place is all outliers
+    turns = _AROUND * prior.rotation * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    around = RigidMotions.exp(turns, np.zeros_like(turns))
+    for view in views:
+        misfit = Misfit(here, descent, int(view), prior, quadratic)
+        start = misfit.at(motions[view : view + 1], here.mask)
+        end = _descended(misfit, start, here.mask)
+        if not _is_found(start, end, prior):
+            others = [misfit.at(around[k : k + 1], here.mask) for k in range(len(turns))]
+            end = min((_descended(misfit, other, here.mask) for other in others), key=lambda fit: fit.loss)
+        if _is_found(start, end, prior):
+            rotation[view], translation[view] = end.motion.rotation[0], end.motion.translation[0]
+            found.append(view)
+    return RigidMotions(rotation, translation), np.array(found, np.int64)
+
+
+def _is_found(start: Fit, end: Fit, prior: Prior) -> bool:
+    away = np.concatenate(end.motion.vectors(), axis=1)[0] * np.sqrt(prior.precision())
+    return end.rms < _FOUND * start.rms and bool(np.abs(away).max() < _FARTHEST)
+
+
+def _descended(misfit: Misfit, fit: Fit, mask: Floats | None) -> Fit:
+    damping = _DAMPING
+    for _ in range(_STEPS):
+        trial = misfit.at(misfit.stepped(fit, damping), mask)
+        if trial.loss >= fit.loss:
+            damping *= _TIGHTENED
+            if damping > _STUCK:
+                break
+            continue
+        settled = trial.loss > (1 - _SETTLED) * fit.loss
+        fit, damping = trial, max(_EASED * damping, _DAMPING)
+        if settled:
+            break
+    return fit
