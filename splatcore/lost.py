@@ -21,7 +21,7 @@ from splatcore.trial import Indices
 
 _STANDS_OUT = 1.5  # times the median residual: by less, noise and the object's sides differ
 _FOUND = 0.75  # times its residual before: within its own minimum a view gains less
-_FARTHEST = 5.0  # standard deviations of the prior: an image of nothing fits best where the object is out of sight
+_FARTHEST = 5.0  # shift, in standard deviations of the prior: an image of nothing fits best with nothing in sight
 _AROUND = 2.4  # standard deviations of the prior, about each axis: where else to begin
 _STEPS = 40
 _DAMPING, _EASED, _TIGHTENED, _STUCK = 1e-3, 0.2, 6.0, 1e6
@@ -58,8 +58,8 @@ def find_again(
 
 
 def _is_found(start: Fit, end: Fit, prior: Prior) -> bool:
-    away = np.concatenate(end.motion.vectors(), axis=1)[0] * np.sqrt(prior.precision())
-    return end.rms < _FOUND * start.rms and bool(np.abs(away).max() < _FARTHEST)
+    in_sight = np.abs(end.motion.translation).max() < _FARTHEST * prior.translation
+    return end.rms < _FOUND * start.rms and bool(in_sight)
 
 
 def _descended(misfit: Misfit, fit: Fit, mask: Floats | None) -> Fit:
