@@ -53,7 +53,7 @@ METHODS = {
                 ("FDK", "fdk", "FDK", {"snapshots": (1,)}),
                 ("SART", "sart", "SART, a view at a time", {"snapshots": (1, 2, 3), "relaxation": 1.0, "subset": 1}),
                 ("OSEM", "osem", "OSEM, subsets of 5 views", {"snapshots": (1, 2, 3, 4, 5), "subset": 5}),
-                ("TV-CG", "tvcg", "conjugate gradients with total variation", {"snapshots": (4, 8, 12, 24), "tv": 5e-5}),
+                ("TV-CG", "tvcg", "conjugate gradients, total variation", {"snapshots": (4, 8, 12, 24), "tv": 5e-5}),
             )
             for frames, whose in (("nominal", "nominal frames"), ("ours", "our frames"), ("true", _KNOWN))
         ),
