@@ -230,16 +230,16 @@ class Calibration:
             "moved_mm": float(np.hypot(np.sqrt((tau**2).sum(axis=1).mean()), shift)),
         }
 
-    def find_lost(self, here: Level, descent: Descent) -> int:
+    def find_lost(self, here: Level, descent: Descent, around: bool) -> int:
         """Look for the place of views that stand out against the others (splatcore.lost). Returns how many were found.
 
-        Only where every view moves for itself, and after a sweep."""
+        After a sweep, and only where every view moves for itself. around: from places around nominal too."""
         together = self._alone or (self.decision is not None and self.decision.model != "full")
         if self.normals is None or together:
             return 0
         views = lost_views(self.normals)
         scanner = replace(here, nominal=self.at(here.nominal).apply(here.nominal))
-        self.motions, found = find_again(scanner, descent, self.motions, views, self.prior)
+        self.motions, found = find_again(scanner, descent, self.motions, views, self.prior, around=around)
         return len(found)
 
     def entries(self, corrected: Frames, orientation: dict[str, bool]) -> tuple[dict[str, float], dict[str, float]]:

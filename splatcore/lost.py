@@ -3,8 +3,8 @@
 A sweep moves all views a little, with the others' needs in mind. A view that began far off lags behind, and what it
 shows pulls at the volume from the wrong side. Once the others agree, it stands out: it fits much worse than they do.
 Then its six numbers alone are solved to the end, the volume held (Levenberg 1944, Marquardt 1963): from where it is,
-and if that leads nowhere from places around nominal. What was found counts if the view fits so much better that it
-must have been lost.
+and at the end of a level, if that led nowhere, from places around nominal. What was found counts if the view fits so
+much better that it must have been lost.
 """
 
 from __future__ import annotations
@@ -34,22 +34,23 @@ def lost_views(normals: Normals) -> Indices:
 
 
 def find_again(
-    here: Level, descent: Descent, motions: RigidMotions, views: Indices, prior: Prior
+    here: Level, descent: Descent, motions: RigidMotions, views: Indices, prior: Prior, *, around: bool
 ) -> tuple[RigidMotions, Indices]:
     """The motions with those of the views that were found, and the indices of these.
 
-    here: its nominal frames are those before any view's own motion; views: indices of those to look for."""
+    here: its nominal frames are those before any view's own motion; views: indices of those to look for; around: from
+    places around nominal as well, which takes ten times as long where there is nothing to find."""
     rotation, translation = motions.rotation.copy(), motions.translation.copy()
     found = []
     quadratic = float(np.abs(here.images).max())  # a view in the wrong place is all outliers
     turns = _AROUND * prior.rotation * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    around = RigidMotions.exp(turns, np.zeros_like(turns))
+    places = RigidMotions.exp(turns, np.zeros_like(turns))
     for view in views:
         misfit = Misfit(here, descent, int(view), prior, quadratic)
         start = misfit.at(motions[view : view + 1], here.mask)
         end = _descended(misfit, start, here.mask)
-        if not _is_found(start, end, prior):
-            others = [misfit.at(around[k : k + 1], here.mask) for k in range(len(turns))]
+        if around and not _is_found(start, end, prior):
+            others = [misfit.at(places[k : k + 1], here.mask) for k in range(len(turns))]
             end = min((_descended(misfit, other, here.mask) for other in others), key=lambda fit: fit.loss)
         if _is_found(start, end, prior):
             rotation[view], translation[view] = end.motion.rotation[0], end.motion.translation[0]

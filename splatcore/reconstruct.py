@@ -241,7 +241,7 @@ class _Run:
             if not calibration.fixed and step >= first_sweep:
                 moved = calibration.sweep(here, descent, finest)
                 if 2 * step >= work.steps:  # by now most views agree
-                    found = calibration.find_lost(here, descent)
+                    found = calibration.find_lost(here, descent, around=step == work.steps)
                 packed = calibration.corrected(here.nominal).packed()
             if drifting and step >= first_sweep:
                 corrected = calibration.corrected(here.nominal)

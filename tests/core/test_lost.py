@@ -52,7 +52,7 @@ def test_a_view_far_off_stands_out_and_is_found(held):
     motions = with_one_away()
     views = standing_out(here, descent, motions)
     assert views == [LOST]
-    back, found = find_again(here, descent, motions, np.array(views), PRIOR)
+    back, found = find_again(here, descent, motions, np.array(views), PRIOR, around=True)
     assert found.tolist() == [LOST]
     omega, tau = back.vectors()
     assert np.rad2deg(np.abs(omega[LOST])).max() < 0.5, np.rad2deg(omega[LOST])
@@ -65,7 +65,7 @@ def test_views_in_their_places_do_not_stand_out_and_are_left_alone(held):
     here, descent = held
     right = RigidMotions.identity(24)
     assert standing_out(here, descent, right) == []
-    same, found = find_again(here, descent, right, np.arange(24), PRIOR)
+    same, found = find_again(here, descent, right, np.arange(24), PRIOR, around=True)
     assert not len(found)
     assert np.array_equal(same.rotation, right.rotation) and np.array_equal(same.translation, right.translation)
 
@@ -77,7 +77,7 @@ def test_an_image_of_nothing_has_no_place(held):
     blank = replace(here, images=images)
     right = RigidMotions.identity(24)
     assert standing_out(blank, descent, right) == [LOST]
-    same, found = find_again(blank, descent, right, np.array([LOST]), PRIOR)
+    same, found = find_again(blank, descent, right, np.array([LOST]), PRIOR, around=True)
     assert not len(found) and np.array_equal(same.translation, right.translation)
 
 
@@ -87,7 +87,7 @@ def test_no_view_is_looked_for_where_none_may_move_for_itself(held, tmp_path):
     calibration = Calibration(scan, resolved(scan, Options(calibrate="static", threads=1)))
     calibration.motions = with_one_away()
     calibration.normals = calibration.accumulate(here, descent)
-    assert calibration.find_lost(here, descent) == 0
+    assert calibration.find_lost(here, descent, around=True) == 0
     assert np.array_equal(calibration.motions.rotation, with_one_away().rotation)
 
 
@@ -101,5 +101,5 @@ def test_views_far_off_are_found_in_a_reconstruction(tmp_path, monkeypatch):
         return float(rms.max() / np.median(rms))
 
     assert worst() < 1.5
-    monkeypatch.setattr(Calibration, "find_lost", lambda *_: 0)
+    monkeypatch.setattr(Calibration, "find_lost", lambda *_, **__: 0)
     assert worst() > 2.5
