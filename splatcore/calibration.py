@@ -115,8 +115,9 @@ class Calibration:
 
     def settle_yaw(self) -> None:
         """Once views are free and their resolution is good enough to judge: is there a yaw at all?"""
-        if self._options.calibrate == "full" and self._yaw_free and self.normals is not None:
-            sigma = sigmas_of_mean(self.normals, self._scan.frames, self.prior)[3]
+        normals = self._whole_normals
+        if self._options.calibrate == "full" and self._yaw_free and normals is not None:
+            sigma = sigmas_of_mean(normals, self._scan.frames, self.prior)[3]
             self.static, self._yaw_free = without_doubtful_yaw(
                 self._scan.frames, self.static, self.motions, float(sigma)
             )
@@ -231,16 +232,28 @@ class Calibration:
         }
 
     def find_lost(self, here: Level, descent: Descent, around: bool) -> int:
-        """Look for the place of views that stand out against the others (splatcore.lost). Returns how many were found.
+        """Look for the place of views that stand out against the others (splatcore.lost). Returns how many were found;
+        the splats follow the gauge.
 
-        After a sweep, and only where every view moves for itself. around: from places around nominal too."""
-        together = self._alone or (self.decision is not None and self.decision.model != "full")
-        if self.normals is None or together:
+        After a sweep, and only where every view moves for itself. around: from places around nominal too, and by what
+        the sweep has left in place of what it found."""
+        if self._alone or (self.decision is not None and self.decision.model != "full"):
             return 0
-        views = lost_views(self.normals)
+        normals = self.accumulate(here, descent) if around else self._whole_normals
+        if normals is None:
+            return 0
         scanner = replace(here, nominal=self.at(here.nominal).apply(here.nominal))
-        self.motions, found = find_again(scanner, descent, self.motions, views, self.prior, around=around)
+        motions, found = find_again(scanner, descent, self.motions, lost_views(normals), self.prior, around=around)
+        if len(found):
+            similarity, self.motions = settle(scanner.nominal, motions)
+            descent.replace(descent.splats.moved(similarity))
         return len(found)
+
+    @property
+    def _whole_normals(self) -> Normals | None:
+        """The last normal equations, unless they are of some views only."""
+        whole = self.normals is not None and len(self.normals.pixels) == len(self.motions.rotation)
+        return self.normals if whole else None
 
     def entries(self, corrected: Frames, orientation: dict[str, bool]) -> tuple[dict[str, float], dict[str, float]]:
         """The scanner's constant errors, and the standard deviations of those that were solved."""

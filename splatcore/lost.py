@@ -39,22 +39,23 @@ def find_again(
     """The motions with those of the views that were found, and the indices of these.
 
     here: its nominal frames are those before any view's own motion; views: indices of those to look for; around: from
-    places around nominal as well, which takes ten times as long where there is nothing to find."""
+    places around nominal as well, which takes eight times as long where there is nothing to find."""
     rotation, translation = motions.rotation.copy(), motions.translation.copy()
-    found = []
-    quadratic = float(np.abs(here.images).max())  # a view in the wrong place is all outliers
+    found: list[int] = []
+    corner = float(np.abs(here.images).max())  # none is an outlier: a view in the wrong place would be all outliers
     turns = _AROUND * prior.rotation * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     places = RigidMotions.exp(turns, np.zeros_like(turns))
     for view in views:
-        misfit = Misfit(here, descent, int(view), prior, quadratic)
+        misfit = Misfit(here, descent, int(view), prior, corner)
         start = misfit.at(motions[view : view + 1], here.mask)
         end = _descended(misfit, start, here.mask)
         if around and not _is_found(start, end, prior):
             others = [misfit.at(places[k : k + 1], here.mask) for k in range(len(turns))]
-            end = min((_descended(misfit, other, here.mask) for other in others), key=lambda fit: fit.loss)
+            ends = [_descended(misfit, other, here.mask) for other in others]
+            end = min(ends, key=lambda fit: (not _is_found(start, fit, prior), fit.loss))
         if _is_found(start, end, prior):
             rotation[view], translation[view] = end.motion.rotation[0], end.motion.translation[0]
-            found.append(view)
+            found.append(int(view))
     return RigidMotions(rotation, translation), np.array(found, np.int64)
 
 

@@ -9,7 +9,8 @@ import pytest
 
 from splatcore.calibration import Calibration
 from splatcore.descent import Descent
-from splatcore.geometry import RigidMotions
+from splatcore.gauge import mean_rotation
+from splatcore.geometry import RigidMotions, vector_from_rotation
 from splatcore.lost import find_again, lost_views
 from splatcore.options import Options
 from splatcore.poses import Prior, accumulate
@@ -79,6 +80,34 @@ def test_an_image_of_nothing_has_no_place(held):
     assert standing_out(blank, descent, right) == [LOST]
     same, found = find_again(blank, descent, right, np.array([LOST]), PRIOR, around=True)
     assert not len(found) and np.array_equal(same.translation, right.translation)
+
+
+def test_a_view_turned_right_away_is_found_from_places_around_nominal(held):
+    here, descent = held
+    motions = RigidMotions.identity(24)
+    motions.rotation[LOST] = RigidMotions.exp(np.deg2rad([[0.0, 150.0, 0.0]]), np.zeros((1, 3))).rotation[0]
+    _, found = find_again(here, descent, motions, np.array([LOST]), PRIOR, around=False)
+    assert not len(found)
+    back, found = find_again(here, descent, motions, np.array([LOST]), PRIOR, around=True)
+    assert found.tolist() == [LOST]
+    assert np.rad2deg(np.abs(back.vectors()[0][LOST])).max() < 0.5
+
+
+def test_the_world_is_settled_after_a_view_was_found(held, tmp_path):
+    here, descent = held
+    scan = scan_of(tmp_path, Simulation(views=24, det=80, seed=3, noise="r2"))
+    calibration = Calibration(scan, resolved(scan, Options(threads=1)))
+    calibration.motions = with_one_away()
+    assert calibration.find_lost(here, descent, around=True) == 1
+    assert np.abs(vector_from_rotation(mean_rotation(calibration.motions.rotation)[None])).max() < 1e-9
+    assert standing_out(here, descent, calibration.motions) == []
+
+
+def test_many_views_of_a_small_detector(tmp_path):
+    """Sweeps that move all views together look at every third of so many; the search and the yaw need them all."""
+    scan = scan_of(tmp_path, Simulation(views=150, det=80, sigma_rot=0.1, sigma_trans=2.0), 24)
+    result = drain(reconstruct(scan, Options(quality="preview", splats=1500, threads=1)))
+    assert np.isfinite(result.residual_rms).all()
 
 
 def test_no_view_is_looked_for_where_none_may_move_for_itself(held, tmp_path):
