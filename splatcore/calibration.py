@@ -55,7 +55,10 @@ _GAUGE = (
 )
 
 # What changes during a run, and so is kept in a checkpoint.
-_STATE = ("prior", "static", "static_sweeps", "motions", "decision", "normals", "_sweeps", "_yaw_free", "_deviation")
+_STATE = (
+    "prior", "static", "static_sweeps", "motions", "decision", "normals",
+    "_sweeps", "_yaw_free", "_deviation", "_found",
+)  # fmt: skip
 
 
 class Calibration:
@@ -78,6 +81,7 @@ class Calibration:
         self.decision: Decision | None = None
         self.normals: Normals | None = None
         self.exposure = Exposure(len(scan.frames))
+        self._found = np.zeros(len(scan.frames), bool)  # views that were lost
         self._deviation = 0.0  # robust residual, line-integral units, from the last sweep
 
     def state(self) -> dict[str, Any]:
@@ -212,7 +216,7 @@ class Calibration:
             reach = _REACH_PX * here.pixel_at_isocentre_mm
             limit = np.array([reach / self._radius] * 3 + [3 * reach] * 3)
             turned = float(np.deg2rad(static.yaw_deg))
-            motions, strain, yaw = step_full(normals, before, self.prior, limit, caution, turned)
+            motions, strain, yaw = step_full(normals, before, self.prior, limit, caution, turned, self._found)
             static = replace(static, yaw_deg=static.yaw_deg + float(np.rad2deg(yaw)))
             if self._separable:
                 static, motions = split_static(here.nominal, static, motions)
@@ -232,8 +236,8 @@ class Calibration:
         }
 
     def find_lost(self, here: Level, descent: Descent, around: bool) -> int:
-        """Look for the place of views that stand out against the others (splatcore.lost). Returns how many were found;
-        the splats follow the gauge.
+        """Look for the place of views that stand out against the others (splatcore.lost). Returns how many were found
+        for the first time; the splats follow the gauge.
 
         After a sweep, and only where every view moves for itself. around: from places around nominal too, and by what
         the sweep has left in place of what it found."""
@@ -247,7 +251,8 @@ class Calibration:
         if len(found):
             similarity, self.motions = settle(scanner.nominal, motions)
             descent.replace(descent.splats.moved(similarity))
-        return len(found)
+        known, self._found = self._found, self._found | np.isin(np.arange(len(self._found)), found)
+        return int((self._found & ~known).sum())
 
     @property
     def _whole_normals(self) -> Normals | None:

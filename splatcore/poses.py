@@ -81,7 +81,13 @@ def accumulate(
 
 
 def step_full(
-    normals: Normals, motions: RigidMotions, prior: Prior, limit: Array, caution: float = 1.0, yaw: float = 0.0
+    normals: Normals,
+    motions: RigidMotions,
+    prior: Prior,
+    limit: Array,
+    caution: float = 1.0,
+    yaw: float = 0.0,
+    found: Array | None = None,
 ) -> tuple[RigidMotions, Array, float]:
     """New poses after one damped Gauss-Newton step, the strain [3, 3] that the object's means must follow, and the
     step of the detector's yaw, rad (zero where the normal equations do not hold it).
@@ -92,13 +98,17 @@ def step_full(
     limit [6]: no component of a view's step exceeds it (rad, mm); the whole step is shortened instead.
     caution: how many pixels count as one independent measurement against the prior.
     yaw: the detector's present yaw, rad, which its prior pulls towards zero.
+    found [views]: whether a view's place was found by a search. Its prior does without the caution, which would draw
+    it back.
     """
     noise = caution * normals.noise
-    precision = prior.precision()
+    precision = np.tile(prior.precision(), (len(motions), 1))
+    if found is not None:
+        precision[found] /= caution
     offset = np.concatenate(motions.vectors(), axis=1)
     hessian = normals.hessian / noise[:, None, None]
     gradient = normals.gradient / noise[:, None]
-    views = hessian[:, :6, :6] + np.diag(precision)
+    views = hessian[:, :6, :6] + precision[:, None] * np.eye(6)
     views += 1e-3 * views * np.eye(6)
     pull = gradient[:, :6] + precision * offset
     mixed = hessian[:, :6, 6:]

@@ -74,6 +74,21 @@ def test_caution_yields_to_the_prior_only_where_the_images_say_little():
     assert np.abs(tau[:, 2]).max() < 0.3  # the height is seen, and found
 
 
+def test_caution_does_not_draw_back_a_view_that_was_found():
+    splats, frames, renderer, draw = scene()
+    images = draw(splats, frames)
+    noise = np.random.default_rng(6).normal(0, 0.02 * images.max(), images.shape).astype(np.float32)
+    turned = RigidMotions.exp(np.tile([0.0, 0.0, 0.3], (10, 1)), np.zeros((10, 3)))
+    normals = accumulate(renderer, splats, frames, images + noise, None, 1.0)  # in place where turned
+    there = turned.inverse().correct(frames)
+    assert np.allclose(turned.correct(there).packed(), frames.packed())
+    found = np.arange(10) < 5
+    tight = Prior(0.05, 5.0, strain=1e-9)
+    step, _, _ = step_full(normals, turned, tight, LIMIT, caution=3e4, found=found)
+    moved = np.linalg.norm((step @ turned.inverse()).vectors()[0], axis=1)
+    assert moved[found].max() < 0.1 * moved[~found].min()
+
+
 def test_steps_are_limited():
     splats, frames, renderer, draw = scene()
     far = RigidMotions.exp(np.tile([0, 0, 0.3], (10, 1)), np.zeros((10, 3)))
