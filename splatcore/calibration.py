@@ -57,7 +57,7 @@ _GAUGE = (
 # What changes during a run, and so is kept in a checkpoint.
 _STATE = (
     "prior", "static", "static_sweeps", "motions", "decision", "normals",
-    "_sweeps", "_yaw_free", "_deviation", "_found",
+    "_sweeps", "_yaw_free", "_deviation", "_found", "_in_vain",
 )  # fmt: skip
 
 
@@ -82,6 +82,7 @@ class Calibration:
         self.normals: Normals | None = None
         self.exposure = Exposure(len(scan.frames))
         self._found = np.zeros(len(scan.frames), bool)  # views that were lost
+        self._in_vain = np.zeros(len(scan.frames), bool)  # views looked for at this level and not found
         self._deviation = 0.0  # robust residual, line-integral units, from the last sweep
 
     def state(self) -> dict[str, Any]:
@@ -239,19 +240,24 @@ class Calibration:
         """Look for the place of views that stand out against the others (splatcore.lost). Returns how many were found
         for the first time; the splats follow the gauge.
 
-        After a sweep, and only where every view moves for itself. around: from places around nominal too, and by what
-        the sweep has left in place of what it found."""
+        After a sweep, and only where every view moves for itself; no view twice in vain at one level, but at its end.
+        around: the level ends; from places around nominal too, and by what the sweep has left in place of what it
+        found."""
         if self._alone or (self.decision is not None and self.decision.model != "full"):
             return 0
         normals = self.accumulate(here, descent) if around else self._whole_normals
         if normals is None:
             return 0
         scanner = replace(here, nominal=self.at(here.nominal).apply(here.nominal))
-        motions, found = find_again(scanner, descent, self.motions, lost_views(normals), self.prior, around=around)
+        lost = lost_views(normals)
+        sought = lost if around else lost[~self._in_vain[lost]]
+        motions, found = find_again(scanner, descent, self.motions, sought, self.prior, around=around)
         if len(found):
             similarity, self.motions = settle(scanner.nominal, motions)
             descent.replace(descent.splats.moved(similarity))
-        known, self._found = self._found, self._found | np.isin(np.arange(len(self._found)), found)
+        every, known = np.arange(len(self._found)), self._found
+        self._found = known | np.isin(every, found)
+        self._in_vain = (self._in_vain | np.isin(every, np.setdiff1d(sought, found))) & (not around)
         return int((self._found & ~known).sum())
 
     @property

@@ -140,6 +140,26 @@ def test_a_coarse_sweep_does_not_draw_a_found_view_back(held, tmp_path):
     assert abs(kept - 12.0) < 1.0, kept
 
 
+def test_a_view_looked_for_in_vain_is_looked_for_again_at_the_end_of_the_level(held, tmp_path, monkeypatch):
+    here, descent = held
+    scan = scan_of(tmp_path, Simulation(views=24, det=80, seed=3, noise="r2"))
+    images = here.images.copy()
+    images[LOST] = 0  # no place is right
+    blank = replace(here, images=images)
+    calibration = Calibration(scan, resolved(scan, Options(threads=1)))
+    calibration.normals = calibration.accumulate(blank, descent)
+    sought: list[list[int]] = []
+
+    def spy(*args, **kwargs):
+        sought.append(args[3].tolist())
+        return find_again(*args, **kwargs)
+
+    monkeypatch.setattr("splatcore.calibration.find_again", spy)
+    for around in (False, False, True, False, False):
+        calibration.find_lost(blank, descent, around)
+    assert sought == [[LOST], [], [LOST], [LOST], []]
+
+
 def test_many_views_of_a_small_detector(tmp_path):
     """Sweeps that move all views together look at every third of so many; the search and the yaw need them all."""
     scan = scan_of(tmp_path, Simulation(views=150, det=80, sigma_rot=0.1, sigma_trans=2.0), 24)
