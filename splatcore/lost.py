@@ -2,9 +2,10 @@
 
 A sweep moves all views a little, with the others' needs in mind. A view that began far off lags behind, and what it
 shows pulls at the volume from the wrong side. Once the others agree, it stands out: it fits much worse than they do.
-Then its six numbers alone are solved to the end, the volume held (Levenberg 1944, Marquardt 1963): from where it is,
-and at the end of a level, if that led nowhere, from places around nominal. What was found counts if the view fits so
-much better that it must have been lost.
+Then its pose alone is solved to the end, the volume held (Levenberg 1944, Marquardt 1963): from where it is, and at the
+end of a level, if that led nowhere, from places around nominal; only along directions that its image shows clearly, for
+the others follow the errors of a coarse model. What was found counts if the view fits so much better that it must have
+been lost.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from splatcore.descent import Descent
 from splatcore.geometry import RigidMotions
 from splatcore.misfit import Fit, Misfit
-from splatcore.poses import Normals, Prior
+from splatcore.poses import Normals, Prior, clear_directions
 from splatcore.pyramid import Level
 from splatcore.splats import Floats
 from splatcore.trial import Indices
@@ -67,7 +68,7 @@ def _is_found(start: Fit, end: Fit, prior: Prior) -> bool:
 def _descended(misfit: Misfit, fit: Fit, mask: Floats | None) -> Fit:
     damping = _DAMPING
     for _ in range(_STEPS):
-        trial = misfit.at(misfit.stepped(fit, damping), mask)
+        trial = misfit.at(misfit.stepped(fit, damping, clear_directions(fit.hessian)), mask)
         if trial.loss >= fit.loss:
             damping *= _TIGHTENED
             if damping > _STUCK:

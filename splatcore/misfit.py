@@ -12,6 +12,8 @@ from splatcore.poses import Prior, accumulate
 from splatcore.pyramid import Level
 from splatcore.splats import Floats
 
+_ANYWHERE = np.eye(6)
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -42,10 +44,11 @@ class Misfit:
             float(normals.noise[0]), float(normals.rms[0]),
         )  # fmt: skip
 
-    def stepped(self, fit: Fit, damping: float) -> RigidMotions:
-        """The pose after one damped Gauss-Newton step, the prior counted in."""
+    def stepped(self, fit: Fit, damping: float, within: Array = _ANYWHERE) -> RigidMotions:
+        """The pose after one damped Gauss-Newton step along the columns of `within` [6, n], the prior counted in."""
         system = fit.hessian / fit.noise + self._precision
         system += damping * np.diag(np.diag(system))
         offset = np.concatenate(fit.motion.vectors(), axis=1)[0]
-        increment = -np.linalg.solve(system, fit.gradient / fit.noise + self._precision @ offset)[None]
+        slope = fit.gradient / fit.noise + self._precision @ offset
+        increment = -(within @ np.linalg.solve(within.T @ system @ within, within.T @ slope))[None]
         return fit.motion @ RigidMotions.exp(increment[:, :3], increment[:, 3:])

@@ -16,6 +16,8 @@ from splatcore.geometry import Array, Frames, RigidMotions
 from splatcore.planar import in_plane
 from splatcore.splats import Floats, Splats
 
+_CLEAR = 0.1  # of the information about the turn that is shown best
+
 
 @dataclass(frozen=True)
 class Normals:
@@ -98,19 +100,21 @@ def step_full(
     limit [6]: no component of a view's step exceeds it (rad, mm); the whole step is shortened instead.
     caution: how many pixels count as one independent measurement against the prior.
     yaw: the detector's present yaw, rad, which its prior pulls towards zero.
-    found [views]: whether a view's place was found by a search. Its prior does without the caution, which would draw
-    it back.
+    found [views]: whether a view's place was found by a search. Where its image shows its motion clearly, its prior
+    does without the caution, which would draw it back.
     """
     noise = caution * normals.noise
-    precision = np.tile(prior.precision(), (len(motions), 1))
-    if found is not None:
-        precision[found] /= caution
+    precision = prior.precision()
+    hold = np.tile(np.diag(precision), (len(motions), 1, 1))
+    for view in [] if found is None else np.flatnonzero(found):
+        clear = clear_directions(normals.rigid[view])
+        hold[view] -= (1 - 1 / caution) * precision * (clear @ clear.T)
     offset = np.concatenate(motions.vectors(), axis=1)
     hessian = normals.hessian / noise[:, None, None]
     gradient = normals.gradient / noise[:, None]
-    views = hessian[:, :6, :6] + precision[:, None] * np.eye(6)
+    views = hessian[:, :6, :6] + hold
     views += 1e-3 * views * np.eye(6)
-    pull = gradient[:, :6] + precision * offset
+    pull = gradient[:, :6] + np.einsum("vij,vj->vi", hold, offset)
     mixed = hessian[:, :6, 6:]
     solved = np.linalg.solve(views, np.concatenate([pull[..., None], mixed], axis=2))
     schur = hessian[:, 6:, 6:].sum(axis=0) - np.einsum("vij,vik->jk", mixed, solved[..., 1:])
@@ -128,6 +132,15 @@ def step_full(
         np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
         float(shared[6]) if len(shared) > 6 else 0.0,
     )
+
+
+def clear_directions(rigid: Array) -> Array:
+    """An orthonormal basis [6, n] of the motions of one view that its image shows clearly, by its normal equations
+    [6, 6]: all but turns that it shows far worse than others, as that of a nearly round object about its axis."""
+    turn, mixed, shift = rigid[:3, :3], rigid[:3, 3:], rigid[3:, 3:]
+    values, vectors = np.linalg.eigh(turn - mixed @ np.linalg.pinv(shift, rcond=1e-9, hermitian=True) @ mixed.T)
+    clear = vectors[:, values > _CLEAR * values[-1]]
+    return np.block([[clear, np.zeros((3, 3))], [np.zeros((3, clear.shape[1])), np.eye(3)]])
 
 
 def sigmas(normals: Normals, prior: Prior) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from splatcore import _native
 from splatcore.geometry import RigidMotions, circular
-from splatcore.poses import Prior, accumulate, sigmas, step_full
+from splatcore.poses import Prior, accumulate, clear_directions, sigmas, step_full
 from splatcore.splats import Splats
 
 LOOSE = Prior(rotation=0.1, translation=10.0)
@@ -87,6 +87,21 @@ def test_caution_does_not_draw_back_a_view_that_was_found():
     step, _, _ = step_full(normals, turned, tight, LIMIT, caution=3e4, found=found)
     moved = np.linalg.norm((step @ turned.inverse()).vectors()[0], axis=1)
     assert moved[found].max() < 0.1 * moved[~found].min()
+
+
+def test_turns_that_an_image_hardly_shows_are_not_clear():
+    splats, frames, renderer, draw = scene()
+    ring = Splats(splats.means * np.float32([0, 0, 1]), np.full_like(splats.scales, 6.0), *splats.arrays()[2:])
+    shifts = np.eye(6)[:, 3:]
+    for what, turns in ((splats, 3), (ring, 1)):  # blobs on the axis: the turn about the ray alone
+        for rigid in accumulate(renderer, what, frames, draw(what, frames), None, 1.0).rigid:
+            basis = clear_directions(rigid)
+            assert basis.shape == (6, turns + 3)
+            assert np.allclose(basis.T @ basis, np.eye(turns + 3))
+            assert np.allclose(basis @ basis.T @ shifts, shifts)
+            if what is ring:
+                assert np.abs(basis[2]).max() < 0.01  # about the axis
+    assert clear_directions(np.zeros((6, 6))).shape == (6, 3)  # nothing in sight
 
 
 def test_steps_are_limited():
