@@ -5,7 +5,7 @@ reconstruction is made from the other views, posed as a model of the motion says
 held-out view as well. Then that view is set free: six numbers are fitted to one half of its pixels (squares of a
 checkerboard) and judged on the other half, and the halves change places. A model stands if freedom predicts the
 unseen half no better than the model did. Models are tried from the least free to the freest; the first that stands
-is taken (docs/method.md, "How freely views may move").
+is taken (docs/method/gate.md).
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ import numpy as np
 from splatcore.geometry import Array, RigidMotions
 from splatcore.poses import Prior
 
-# Variance of a settled pose found with the volume, over that with the volume known: measured 3.5 to 7 on scans with
-# right poses (docs/method.md).
+# Variance of a settled pose found with the volume, over that with the volume known: measured 4.3 to 7.1 on scans with
+# right poses (docs/method/gate.md).
 _VOLUME_UNKNOWN = 4.0
 _CONTRADICTED = 2.0  # drop of the log likelihood: two standard deviations
 _COARSE = 1.5  # poses of a coarse level are drawn to nominal themselves: true widths were 1.0 to 1.6 times those found

@@ -1,4 +1,4 @@
-"""The scanner's constant errors: four numbers that all views share, and how far each shows (docs/method.md).
+"""The scanner's constant errors: four numbers that all views share, and how far each shows (docs/method/static.md).
 
 Seen from a view, with u its columns, v its rows and n = u x v:
 

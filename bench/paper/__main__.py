@@ -23,7 +23,7 @@ from bench.paper.run import Bench
 from bench.paper.scenes import SCENES, find_volume
 from splatcore.machine import threads_allowed
 
-_QUICK_SCENES, _QUICK_EDGE, _QUICK_STEPS, _QUICK_VIEWS = ("head", "pelvis"), 64, 1500, 50
+_QUICK_SCENES, _QUICK_EDGE, _QUICK_STEPS, _QUICK_VIEWS = ("head",), 64, 1500, 50
 _QUICK_ONLY = "headline,right,rtk"
 
 
