@@ -1,6 +1,6 @@
 """SplatCT beside the paper, R2-Gaussian, classical methods and RTK, on simulated scans of real objects.
 
-    python -m bench.paper --quick                      a few minutes on two cores
+    python -m bench.paper --quick                      ten minutes on two cores
     python -m bench.paper --data DIR --out results     everything; hours: R2-Gaussian and the paper take 30,000 steps
     python -m bench.paper --only headline,rtk --projector rtk --rtk-python RTKENV/bin/python
 
