@@ -59,6 +59,9 @@ def main() -> None:
     parser.add_argument("--seeds", default="0")
     parser.add_argument("--threads", type=int, default=threads_allowed())
     args = parser.parse_args()
+    for name in args.scenes.split(","):
+        if name != "prism" and name not in SCENES:
+            parser.error(f"--scenes: got {name!r}, expected of prism, {', '.join(SCENES)}")
     print("| | lost: without, with | median: without, with | PSNR: without, with | seconds: without, with |")
     print("|---|---:|---:|---:|---:|")
     for name in args.scenes.split(","):

@@ -255,10 +255,13 @@ class Calibration:
         if len(found):
             similarity, self.motions = settle(scanner.nominal, motions)
             descent.replace(descent.splats.moved(similarity))
-        every, known = np.arange(len(self._found)), self._found
-        self._found = known | np.isin(every, found)
-        self._in_vain = (self._in_vain | np.isin(every, np.setdiff1d(sought, found))) & (not around)
-        return int((self._found & ~known).sum())
+        anew = int(np.count_nonzero(~self._found[found]))
+        # New arrays: those that a state holds stay as they are.
+        self._found, in_vain = self._found.copy(), self._in_vain.copy()
+        self._found[found] = in_vain[sought] = True
+        in_vain[found] = False
+        self._in_vain = in_vain & (not around)
+        return anew
 
     @property
     def _whole_normals(self) -> Normals | None:

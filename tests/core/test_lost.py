@@ -35,11 +35,15 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> tuple[Level, Descent]:
     return here, descent
 
 
-def with_one_away(times: float = 1.0) -> RigidMotions:
-    far = RigidMotions.exp(times * np.deg2rad([[9.0, -6.0, 7.0]]), times * np.array([[4.0, -3.0, 3.0]]))  # rad, mm
+def one_moved(turn_deg: list[float], shift_mm: list[float]) -> RigidMotions:
+    move = RigidMotions.exp(np.deg2rad([turn_deg]), np.array([shift_mm]))
     motions = RigidMotions.identity(24)
-    motions.rotation[LOST], motions.translation[LOST] = far.rotation[0], far.translation[0]
+    motions.rotation[LOST], motions.translation[LOST] = move.rotation[0], move.translation[0]
     return motions
+
+
+def with_one_away(times: float = 1.0) -> RigidMotions:
+    return one_moved([9.0 * times, -6.0 * times, 7.0 * times], [4.0 * times, -3.0 * times, 3.0 * times])
 
 
 def standing_out(here: Level, descent: Descent, motions: RigidMotions) -> list[int]:
@@ -75,8 +79,7 @@ def test_views_in_their_places_do_not_stand_out_and_are_left_alone(held):
 def test_a_view_within_its_own_minimum_is_left_to_the_sweeps(held):
     """Three degrees off: it would fit better by an eighth, which is no proof that it was lost."""
     here, descent = held
-    motions = RigidMotions.identity(24)
-    motions.rotation[LOST] = RigidMotions.exp(np.deg2rad([[3.0, 0.0, 0.0]]), np.zeros((1, 3))).rotation[0]
+    motions = one_moved([3.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     _, found = find_again(here, descent, motions, np.array([LOST]), PRIOR, around=True)
     assert not len(found)
 
@@ -94,8 +97,7 @@ def test_an_image_of_nothing_has_no_place(held):
 
 def test_a_view_turned_right_away_is_found_from_places_around_nominal(held):
     here, descent = held
-    motions = RigidMotions.identity(24)
-    motions.rotation[LOST] = RigidMotions.exp(np.deg2rad([[0.0, 150.0, 0.0]]), np.zeros((1, 3))).rotation[0]
+    motions = one_moved([0.0, 150.0, 0.0], [0.0, 0.0, 0.0])
     _, found = find_again(here, descent, motions, np.array([LOST]), PRIOR, around=False)
     assert not len(found)
     back, found = find_again(here, descent, motions, np.array([LOST]), PRIOR, around=True)
@@ -119,9 +121,7 @@ def test_the_world_is_settled_after_a_view_was_found(held, tmp_path):
 def test_a_coarse_sweep_does_not_draw_a_found_view_back(held, tmp_path):
     here, descent = held
     scan = scan_of(tmp_path, Simulation(views=24, det=80, seed=3, noise="r2"))
-    turned = RigidMotions.exp(np.deg2rad([[0.0, 0.0, 12.0]]), np.zeros((1, 3)))
-    away = RigidMotions.identity(24)  # the other way round of the nominal frame: the view is in place turned by 12
-    away.rotation[LOST] = turned.rotation[0]
+    away = one_moved([0.0, 0.0, 12.0], [0.0, 0.0, 0.0])  # its nominal frame the other way: so moved it is in place
     nominal = replace(here, nominal=away.inverse().correct(here.nominal))
 
     def after_a_sweep(found: bool) -> float:
