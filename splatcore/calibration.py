@@ -249,9 +249,9 @@ class Calibration:
         if normals is None:
             return 0
         scanner = replace(here, nominal=self.at(here.nominal).apply(here.nominal))
-        lost = lost_views(normals)
+        lost, most = lost_views(normals)
         sought = lost if around else lost[~self._in_vain[lost]]
-        motions, found = find_again(scanner, descent, self.motions, sought, self.prior, around=around)
+        motions, found = find_again(scanner, descent, self.motions, sought, most, self.prior, around=around)
         if len(found):
             similarity, self.motions = settle(scanner.nominal, motions)
             descent.replace(descent.splats.moved(similarity))

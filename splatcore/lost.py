@@ -29,18 +29,19 @@ _DAMPING, _EASED, _TIGHTENED, _STUCK = 1e-3, 0.2, 6.0, 1e6
 _SETTLED = 1e-3  # share of the squared residual: a step that gains less is the last
 
 
-def lost_views(normals: Normals) -> Indices:
-    """Indices of the views whose residual stands out."""
-    return np.flatnonzero(normals.rms > _STANDS_OUT * np.median(normals.rms))
+def lost_views(normals: Normals) -> tuple[Indices, float]:
+    """Indices of the views whose residual stands out, and the residual above which one does."""
+    most = _STANDS_OUT * float(np.median(normals.rms))
+    return np.flatnonzero(normals.rms > most), most
 
 
 def find_again(
-    here: Level, descent: Descent, motions: RigidMotions, views: Indices, prior: Prior, *, around: bool
+    here: Level, descent: Descent, motions: RigidMotions, views: Indices, most: float, prior: Prior, *, around: bool
 ) -> tuple[RigidMotions, Indices]:
     """The motions with those of the views that were found, and the indices of these.
 
-    here: its nominal frames are those before any view's own motion; views: indices of those to look for; around: from
-    places around nominal as well, which takes eight times as long where there is nothing to find."""
+    here: its nominal frames are those before any view's own motion; views, most: as `lost_views` gives them; around:
+    from places around nominal as well where a view stands out still, which takes eight times as long."""
     rotation, translation = motions.rotation.copy(), motions.translation.copy()
     found: list[int] = []
     corner = float(np.abs(here.images).max())  # none is an outlier: a view in the wrong place would be all outliers
@@ -50,9 +51,9 @@ def find_again(
         misfit = Misfit(here, descent, int(view), prior, corner)
         start = misfit.at(motions[view : view + 1], here.mask)
         end = _descended(misfit, start, here.mask)
-        if around and not _is_found(start, end, prior):
+        if around and not (_is_found(start, end, prior) and end.rms <= most):
             others = [misfit.at(places[k : k + 1], here.mask) for k in range(len(turns))]
-            ends = [_descended(misfit, other, here.mask) for other in others]
+            ends = [end, *(_descended(misfit, other, here.mask) for other in others)]
             end = min(ends, key=lambda fit: (not _is_found(start, fit, prior), fit.loss))
         if _is_found(start, end, prior):
             rotation[view], translation[view] = end.motion.rotation[0], end.motion.translation[0]
@@ -69,7 +70,7 @@ def _descended(misfit: Misfit, fit: Fit, mask: Floats | None) -> Fit:
     damping = _DAMPING
     for _ in range(_STEPS):
         trial = misfit.at(misfit.stepped(fit, damping, clear_directions(fit.hessian)), mask)
-        if trial.loss >= fit.loss:
+        if not trial.loss < fit.loss:
             damping *= _TIGHTENED
             if damping > _STUCK:
                 break
