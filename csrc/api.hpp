@@ -95,6 +95,8 @@ struct Core {
   // volume [nz, ny, nx]: overwrites with the density at voxel centres.
   void (*voxelize)(const GridIn&, const SplatsIn<T>&, T* volume, int threads);
   void (*voxelize_vjp)(const GridIn&, const SplatsIn<T>&, const T* v_volume, const SplatsOut<T>& v, int threads);
+  // Mean |difference| of neighbouring voxels along the three axes. Returns it, overwrites its gradient.
+  double (*total_variation)(int nz, int ny, int nx, const T* volume, T* gradient, int threads);
   // One Adam step on raw parameters from gradients of activated ones.
   void (*adam)(const AdamState<T>&, const SplatsOut<T>& gradients, const AdamRates&, int threads);
   // Line integrals of a voxel volume: Joseph's method (bilinear in the slices across the ray's main axis).

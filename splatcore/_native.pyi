@@ -108,6 +108,11 @@ def voxelize_vjp(
     v_density: Real,
     threads: int,
 ) -> None: ...
+def total_variation(
+    volume: Real,  # [nz, ny, nx]
+    gradient: Real,  # [nz, ny, nx]
+    threads: int,
+) -> float: ...
 def adam(
     means: Real,  # this and the following to `second`: updated
     log_scales: Real,

@@ -61,13 +61,15 @@ def low_passed(
     norm = np.maximum(_filtered(coarse, sigmas), 1e-6)
     cone, packed, packed_small = frames.beam == "cone", frames.packed(), small.packed()
     fine = _native.Renderer32(small.rows, small.cols, threads)
-    image, drawn = np.empty(weights.shape, np.float32), np.empty(coarse.shape, np.float32)
+    residual, drawn = np.empty(weights.shape, np.float32), np.empty(coarse.shape, np.float32)
     images = np.empty((len(frames), *coarse.shape), np.float32)
     rough = smooth = 0.0
     for k, target in enumerate(here.images):
-        renderer.render(packed[k], cone, *splats.arrays(), image)
+        renderer.render(packed[k], cone, *splats.arrays(), residual)
         fine.render(packed_small[k], cone, *splats.arrays(), drawn)
-        residual = (image - target) * weights
+        residual -= target
+        if here.mask is not None:
+            residual *= weights
         binned = _filtered(means_of_blocks(residual[None], binning)[0], sigmas)
         filtered = _without_blur((binned / norm).astype(np.float32, copy=False), drawn, coarse)
         images[k] = drawn - filtered

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from splatcore.splats import Floats
 
 _FEWEST_PIXELS = 24  # a side of a level's detector that is shorter than this is no longer binned
 _FACTORS = (8, 4, 2, 1)
+_STRIDED = 4  # pixels along a side of a block up to which its lines are added as they lie: as numpy's mean does, faster
 _THINNEST, _WIDEST = 0.3, 20.0  # standard deviations of a splat, voxels
 
 
@@ -90,8 +92,13 @@ def means_of_blocks(images: Floats, binning: tuple[int, int], good: Floats | Non
     if binning == (1, 1):
         return np.ascontiguousarray(images, np.float32)
     views, rows, cols = images.shape[0], images.shape[1] // down, images.shape[2] // across
-    cut = images[:, : rows * down, : cols * across].reshape(views, rows, down, cols, across)
-    means = np.ascontiguousarray(cut.mean(axis=(2, 4)), np.float32)
+    images = images[:, : rows * down, : cols * across]
+    cut = images.reshape(views, rows, down, cols, across)
+    if max(binning) <= _STRIDED:
+        lines = (reduce(np.add, (images[:, i::down, j::across] for j in range(across))) for i in range(down))
+        means = (reduce(np.add, lines) / np.float32(down * across)).astype(np.float32, copy=False)
+    else:
+        means = np.ascontiguousarray(cut.mean(axis=(2, 4)), np.float32)
     if good is None or good.all():
         return means
     weight = good[: rows * down, : cols * across].reshape(rows, down, cols, across)

@@ -12,28 +12,9 @@ from numpy.typing import NDArray
 
 from splatcore import _native
 from splatcore.grid import VolumeGrid
-from splatcore.splats import Floats, Splats, grid_array
+from splatcore.splats import Splats, grid_array
 
 BOX = 32  # voxels an edge, as R2-Gaussian has it
-
-
-def total_variation(volume: Floats) -> tuple[float, Floats]:
-    """Mean |difference| of neighbours over all three axes of [z, y, x], and its gradient, as large as the volume.
-
-    Where two neighbours are equal the slope is taken as zero.
-    """
-    gradient = np.zeros_like(volume)
-    total, pairs = 0.0, 0
-    for axis in range(3):
-        along, v_along = np.moveaxis(volume, axis, 0), np.moveaxis(gradient, axis, 0)
-        difference = along[1:] - along[:-1]
-        total += float(np.abs(difference).sum(dtype=np.float64))
-        pairs += difference.size
-        slope = np.sign(difference)
-        v_along[1:] += slope
-        v_along[:-1] -= slope
-    gradient /= max(pairs, 1)
-    return total / max(pairs, 1), gradient
 
 
 @dataclass
@@ -60,8 +41,9 @@ class Variation:
         box = grid_array(VolumeGrid(self._shape, self.grid.voxel_mm, (x, y, z)))
         some = Splats(*(array[near] for array in splats.arrays()))
         _native.voxelize(box, *some.arrays(), self._volume, self.threads)
-        value, slope = total_variation(self._volume)
-        slope *= self.weight
+        slope = np.empty_like(self._volume)
+        value = _native.total_variation(self._volume, slope, self.threads)
+        slope *= np.float32(self.weight)
         partial = some.zeros_like()
         _native.voxelize_vjp(box, *some.arrays(), slope, *partial.arrays(), self.threads)
         for whole, part in zip(gradient.arrays(), partial.arrays(), strict=True):

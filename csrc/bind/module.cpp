@@ -209,6 +209,18 @@ void bind(nb::module_& m, const char* renderer_name) {
       "v_volume"_a.noconvert(), "v_means"_a.noconvert(), "v_scales"_a.noconvert(), "v_quats"_a.noconvert(),
       "v_density"_a.noconvert(), "threads"_a);
   m.def(
+      "total_variation",
+      [](In3<T> volume, Out3<T> gradient, int threads) {
+        const int nz = static_cast<int>(volume.shape(0)), ny = static_cast<int>(volume.shape(1));
+        const int nx = static_cast<int>(volume.shape(2));
+        require(gradient.shape(0) == volume.shape(0) && gradient.shape(1) == volume.shape(1) &&
+                    gradient.shape(2) == volume.shape(2),
+                "gradient must have the shape of volume");
+        nb::gil_scoped_release release;
+        return core<T>().total_variation(nz, ny, nx, volume.data(), gradient.data(), threads);
+      },
+      "volume"_a.noconvert(), "gradient"_a.noconvert(), "threads"_a);
+  m.def(
       "adam",
       [](OutRows3<T> means, OutRows3<T> log_scales, OutRows4<T> quats, Out1<T> raw_density, OutRows3<T> scales,
          Out1<T> density, Out1<T> first, Out1<T> second, Rows3<T> v_means, Rows3<T> v_scales, Rows4<T> v_quats,

@@ -5,6 +5,7 @@
 #include "cpu/adam.hpp"
 #include "cpu/rays.hpp"
 #include "cpu/renderer.hpp"
+#include "cpu/variation.hpp"
 #include "cpu/voxels.hpp"
 
 namespace splat {
@@ -36,8 +37,8 @@ static double peak_fma(int64_t rounds, int threads) {
 }
 
 template <class T>
-static constexpr Core<T> kCore{make_renderer<T>, voxelize<T>, voxelize_vjp<T>, adam<T>, project_volume<T>,
-                               project_volume_adjoint<T>, backproject<T>, peak_fma<T>};
+static constexpr Core<T> kCore{make_renderer<T>, voxelize<T>, voxelize_vjp<T>, total_variation<T>, adam<T>,
+                               project_volume<T>, project_volume_adjoint<T>, backproject<T>, peak_fma<T>};
 
 const Core<float>& core_float() { return kCore<float>; }
 const Core<double>& core_double() { return kCore<double>; }

@@ -25,7 +25,7 @@ from splatcore.scores import psnr
 from splatcore.simulate import Simulation
 from splatcore.splats import Splats
 from splatcore.tiff import read_stack
-from splatcore.variation import Variation, total_variation
+from splatcore.variation import Variation
 
 from . import scenes
 from .phantom import scan_of
@@ -180,7 +180,12 @@ def test_the_screen_gradient_counts_views_that_show_the_splat() -> None:
     np.testing.assert_allclose(screen.mean(), once, rtol=1e-6)
 
 
-def test_total_variation_gradient() -> None:
+def total_variation(volume: np.ndarray, threads: int = 1) -> tuple[float, np.ndarray]:
+    gradient = np.full_like(volume, np.nan)
+    return _native.total_variation(volume, gradient, threads), gradient
+
+
+def test_total_variation_gradient(isa: str) -> None:
     """Finite differences in double precision."""
     volume = np.random.default_rng(0).uniform(0, 1, (4, 5, 6))
     value, gradient = total_variation(volume)
@@ -193,6 +198,29 @@ def test_total_variation_gradient() -> None:
         minus[index] -= 1e-7
         slope = (total_variation(plus)[0] - total_variation(minus)[0]) / 2e-7
         assert gradient[index] == pytest.approx(slope, abs=1e-8)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 7, 1), (3, 1, 5), (9, 10, 37), (64, 64, 64)])
+def test_total_variation_is_that_of_differences_with_any_number_of_threads(isa: str, shape: tuple[int, ...]) -> None:
+    """Small whole numbers, so that many neighbours are equal."""
+    volume = np.random.default_rng(1).integers(0, 3, shape).astype(np.float32)
+    differences = [np.diff(volume, axis=axis) for axis in range(3)]
+    pairs = max(1, sum(each.size for each in differences))
+    expected = np.zeros_like(volume)
+    for axis, each in enumerate(differences):
+        along, slope = np.moveaxis(expected, axis, 0), np.moveaxis(np.sign(each), axis, 0)
+        along[1:] += slope
+        along[:-1] -= slope
+    value, gradient = total_variation(volume)
+    assert value == pytest.approx(sum(float(np.abs(each).sum()) for each in differences) / pairs, rel=1e-6)
+    assert np.array_equal(gradient, expected / np.float32(pairs))
+    again, other = total_variation(volume, threads=2)
+    assert again == value and np.array_equal(other, gradient)
+
+
+def test_total_variation_wants_arrays_of_one_shape() -> None:
+    with pytest.raises(ValueError, match="gradient must have the shape of volume"):
+        _native.total_variation(np.zeros((2, 3, 4)), np.zeros((2, 3, 3)), 1)
 
 
 def test_variation_of_a_volume_as_small_as_the_box() -> None:
