@@ -49,6 +49,7 @@ from splatcore.static import Static
 from splatcore.structure import aligned
 
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
+_OFTEN, _SELDOM = 16, 3  # epochs of a fine level with a sweep each; epochs to a sweep then, for poses hardly move
 _WORTH_THREADS = 4_000  # splats
 _COARSE = Rates(mean=0.05, log_scale=0.01, quat=0.01)  # shapes that give way easily let the object be strained
 _JOINT = Rates(end=0.02)  # at the finest level: as long as splats move, poses wander with them
@@ -222,6 +223,7 @@ class _Run:
         now, descent = self._under_way, self._descent
         views, cone = len(here.nominal), here.nominal.beam == "cone"
         first_sweep = min(2 * views, int(_SETTLE_IN * work.steps))
+        often = _OFTEN * views if here.grid.voxels > FINE_VOXELS else work.steps
         packed = calibration.corrected(here.nominal).packed()
         while now["step"] < work.steps:
             self._pause()
@@ -238,7 +240,8 @@ class _Run:
                 calibration.settle_yaw()
             moved: dict[str, float] = {}
             found = 0
-            if not calibration.fixed and step >= first_sweep:
+            due = step <= often or step // views % _SELDOM == 0 or step == work.steps
+            if not calibration.fixed and step >= first_sweep and due:
                 moved = calibration.sweep(here, descent, finest)
                 if 2 * step >= work.steps:  # by now most views agree
                     found = calibration.find_lost(here, descent, around=step == work.steps)
