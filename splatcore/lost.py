@@ -3,9 +3,9 @@
 A sweep moves all views a little, with the others' needs in mind. A view that began far off lags behind, and what it
 shows pulls at the volume from the wrong side. Once the others agree, it stands out: it fits much worse than they do.
 Then its pose alone is solved to the end, the volume held (Levenberg 1944, Marquardt 1963): from where it is, and at the
-end of a level, if that led nowhere, from places around nominal; only along directions that its image shows clearly, for
-the others follow the errors of a coarse model. What was found counts if the view fits so much better that it must have
-been lost.
+end of a level, if that led nowhere or the view stands out still, from places around nominal; only along directions that
+its image shows clearly, for the others follow the errors of a coarse model. What was found counts if the view fits so
+much better that it must have been lost.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ def find_again(
     """The motions with those of the views that were found, and the indices of these.
 
     here: its nominal frames are those before any view's own motion; views, most: as `lost_views` gives them; around:
-    from places around nominal as well where a view stands out still, which takes eight times as long."""
+    from places around nominal as well where that finds no place or the view stands out still, which takes eight times
+    as long."""
     rotation, translation = motions.rotation.copy(), motions.translation.copy()
     found: list[int] = []
     corner = float(np.abs(here.images).max())  # none is an outlier: a view in the wrong place would be all outliers

@@ -14,7 +14,7 @@ from splatcore.splats import Floats
 
 _FEWEST_PIXELS = 24  # a side of a level's detector that is shorter than this is no longer binned
 _FACTORS = (8, 4, 2, 1)
-_STRIDED = 4  # pixels along a side of a block up to which its lines are added as they lie: as numpy's mean does, faster
+_STRIDED = 4  # pixels along a side of a block up to which its lines are added one by one: numpy's order, much faster
 _THINNEST, _WIDEST = 0.3, 20.0  # standard deviations of a splat, voxels
 
 
@@ -95,8 +95,10 @@ def means_of_blocks(images: Floats, binning: tuple[int, int], good: Floats | Non
     images = images[:, : rows * down, : cols * across]
     cut = images.reshape(views, rows, down, cols, across)
     if max(binning) <= _STRIDED:
-        lines = (reduce(np.add, (images[:, i::down, j::across] for j in range(across))) for i in range(down))
-        means = (reduce(np.add, lines) / np.float32(down * across)).astype(np.float32, copy=False)
+        means = np.empty((views, rows, cols), np.float32)
+        for image, mean in zip(images, means, strict=True):
+            lines = (reduce(np.add, (image[i::down, j::across] for j in range(across))) for i in range(down))
+            np.divide(reduce(np.add, lines), np.float32(down * across), out=mean)
     else:
         means = np.ascontiguousarray(cut.mean(axis=(2, 4)), np.float32)
     if good is None or good.all():

@@ -49,7 +49,7 @@ from splatcore.static import Static
 from splatcore.structure import aligned
 
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
-_OFTEN, _SELDOM = 16, 3  # epochs of a fine level with a sweep each; epochs to a sweep then, for poses hardly move
+_OFTEN, _SELDOM = 16, 3  # a fine level is swept after each of its first 16 epochs, then after every third
 _WORTH_THREADS = 4_000  # splats
 _COARSE = Rates(mean=0.05, log_scale=0.01, quat=0.01)  # shapes that give way easily let the object be strained
 _JOINT = Rates(end=0.02)  # at the finest level: as long as splats move, poses wander with them
@@ -236,11 +236,11 @@ class _Run:
             step, loss = now["step"], now["loss"]
             require_finite(loss, f"at binning {here.factor}", step)
             self._fraction = self._schedule.fraction(self._stage, step)
-            if self._schedule.levels == 1 and 2 * step >= work.steps:
+            due = step <= often or step // views % _SELDOM == 0 or step == work.steps
+            if due and self._schedule.levels == 1 and 2 * step >= work.steps:
                 calibration.settle_yaw()
             moved: dict[str, float] = {}
             found = 0
-            due = step <= often or step // views % _SELDOM == 0 or step == work.steps
             if not calibration.fixed and step >= first_sweep and due:
                 moved = calibration.sweep(here, descent, finest)
                 if 2 * step >= work.steps:  # by now most views agree

@@ -29,7 +29,7 @@ class Variation:
     def __post_init__(self) -> None:
         nz, ny, nx = (min(self.box, n) for n in self.grid.shape)
         self._shape = (nz, ny, nx)
-        self._volume = np.empty(self._shape, np.float32)
+        self._volume, self._slope = np.empty(self._shape, np.float32), np.empty(self._shape, np.float32)
         self._half = np.array(self._shape[::-1]) * np.array(self.grid.voxel_mm[::-1]) / 2  # x y z
 
     def add_gradient(self, splats: Splats, gradient: Splats, rng: np.random.Generator) -> float:
@@ -41,11 +41,10 @@ class Variation:
         box = grid_array(VolumeGrid(self._shape, self.grid.voxel_mm, (x, y, z)))
         some = Splats(*(array[near] for array in splats.arrays()))
         _native.voxelize(box, *some.arrays(), self._volume, self.threads)
-        slope = np.empty_like(self._volume)
-        value = _native.total_variation(self._volume, slope, self.threads)
-        slope *= np.float32(self.weight)
+        value = _native.total_variation(self._volume, self._slope, self.threads)
+        self._slope *= np.float32(self.weight)
         partial = some.zeros_like()
-        _native.voxelize_vjp(box, *some.arrays(), slope, *partial.arrays(), self.threads)
+        _native.voxelize_vjp(box, *some.arrays(), self._slope, *partial.arrays(), self.threads)
         for whole, part in zip(gradient.arrays(), partial.arrays(), strict=True):
             whole[near] += part
         return self.weight * value

@@ -12,20 +12,20 @@ template <class T>
 inline double against(const T* v, const T* w, int n, T* slope) {
   using P = typename PackLanes<T>::Value;
   const P zero(T(0)), one(T(1));
-  P sum(T(0));
+  P packs(T(0));
   int x = 0;
   for (; x + P::size <= n; x += P::size) {
     const P d = P::load(v + x) - P::load(w + x);
     (P::load(slope + x) + select(d > zero, one, zero) - select(d < zero, one, zero)).store(slope + x);
-    sum += max_of(d, -d);
+    packs += max_of(d, -d);
   }
-  T rest = PackLanes<T>::sum(sum);
+  T sum = PackLanes<T>::sum(packs);
   for (; x < n; ++x) {
     const T d = v[x] - w[x];
     slope[x] += static_cast<T>((d > 0) - (d < 0));  // without a branch that noise would mispredict
-    rest += fabs(d);
+    sum += fabs(d);
   }
-  return rest;
+  return sum;
 }
 
 // Returns the variation, overwrites gradient; where two neighbours are equal the slope is taken as zero.

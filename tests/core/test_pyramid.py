@@ -20,6 +20,8 @@ def test_means_are_those_of_the_blocks_to_the_bit(binning):
     means = means_of_blocks(images(), binning)
     assert means.dtype == np.float32 and means.flags.c_contiguous
     assert np.array_equal(means, blocks.mean(axis=(2, 4)))
+    other = means_of_blocks(np.asfortranarray(images()), binning)
+    assert np.allclose(other, means, atol=1e-6) and other.flags.c_contiguous
 
 
 @pytest.mark.parametrize("binning", [(2, 2), (8, 8)])
