@@ -139,6 +139,15 @@ def test_an_interruption_while_halves_of_less_resolution_are_compared(
     assert bits(after_stops(scan, WHOLE, tmp_path / "run.checkpoint", [moment])) == expected
 
 
+def test_an_interruption_between_sweeps_of_a_fine_level(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its only level, where a yaw that turns out to be none is let go halfway, in the 25th epoch."""
+    monkeypatch.setattr("splatcore.reconstruct.FINE_VOXELS", 0)
+    what = Simulation(views=24, det=56, sigma_rot=0.01, sigma_trans=0.5, noise="r2", seed=3)
+    scan, options = scan_of(tmp_path, what, 28), Options(quality="preview", splats=800, threads=1)
+    expected = bits(drain(reconstruct(scan, options)))
+    assert bits(after_stops(scan, options, tmp_path / "run.checkpoint", [610, 25])) == expected
+
+
 @pytest.mark.slow
 def test_interruptions_again_and_again(scan: Scan, whole: tuple[list[bytes], int], tmp_path: Path) -> None:
     """In every stage, also soon after going on."""
