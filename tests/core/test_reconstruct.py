@@ -116,11 +116,10 @@ def test_same_bits_again_and_at_any_number_of_threads(tmp_path):
 
 
 def test_sweeps_are_seldom_late_in_a_fine_level(tmp_path, monkeypatch):
-    """Here of 20^3 voxels: 50 epochs of 24 steps, a sweep after each of the 2nd to 16th, then after every third, and at
-    the end."""
-    monkeypatch.setattr("splatcore.reconstruct.FINE_VOXELS", 7_000)
-    scan = scan_of(tmp_path, replace(PERTURBED, views=24))
-    events = list(reconstruct(scan, Options(quality="preview", threads=1)))
+    """50 epochs of 24 steps: a sweep after each of the 2nd to 16th, then after every third, and at the end."""
+    monkeypatch.setattr("splatcore.reconstruct.FINE_VOXELS", 0)
+    scan = scan_of(tmp_path, replace(PERTURBED, views=24, det=56), 28)
+    events = list(reconstruct(scan, Options(quality="preview", splats=500, threads=1)))
     sweeps = [event.step // 24 for event in events if event.stage == "poses" and event.level == 2 and event.step]
     assert sweeps == [*range(2, 17), *range(18, 50, 3), 50]
 
