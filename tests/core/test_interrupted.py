@@ -139,6 +139,7 @@ def test_an_interruption_while_halves_of_less_resolution_are_compared(
     assert bits(after_stops(scan, WHOLE, tmp_path / "run.checkpoint", [moment])) == expected
 
 
+@pytest.mark.slow
 def test_an_interruption_between_sweeps_of_a_fine_level(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its only level, where a yaw that turns out to be none is let go halfway, in the 25th epoch."""
     monkeypatch.setattr("splatcore.reconstruct.FINE_VOXELS", 0)
