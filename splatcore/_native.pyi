@@ -110,9 +110,11 @@ def voxelize_vjp(
 ) -> None: ...
 def total_variation(
     volume: Real,  # [nz, ny, nx]
-    gradient: Real,  # [nz, ny, nx]
+    gradient: Real,  # [nz, ny, nx], overwritten
     threads: int,
-) -> float: ...
+) -> float:
+    """Returns the mean |difference| of neighbouring voxels along the three axes."""
+
 def adam(
     means: Real,  # this and the following to `second`: updated
     log_scales: Real,

@@ -71,7 +71,7 @@ def _descended(misfit: Misfit, fit: Fit, mask: Floats | None) -> Fit:
     damping = _DAMPING
     for _ in range(_STEPS):
         trial = misfit.at(misfit.stepped(fit, damping, clear_directions(fit.hessian)), mask)
-        if not trial.loss < fit.loss:
+        if not trial.loss < fit.loss:  # nor where it is no number
             damping *= _TIGHTENED
             if damping > _STUCK:
                 break

@@ -32,7 +32,7 @@ inline double against(const T* v, const T* w, int n, T* slope) {
 template <class T>
 double total_variation(int nz, int ny, int nx, const T* volume, T* gradient, int threads) {
   const int64_t plane = static_cast<int64_t>(ny) * nx;
-  const int64_t pairs = (nz - 1) * plane + static_cast<int64_t>(nz) * (plane - nx) + static_cast<int64_t>(nz) * ny * (nx - 1);
+  const int64_t pairs = (nz - 1) * plane + nz * (plane - nx) + nz * (plane - ny);
   const T each = static_cast<T>(pairs > 0 ? pairs : 1);
   Buffer<double> partial;
   double* sums = partial.reserve(nz);
