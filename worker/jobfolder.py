@@ -30,11 +30,14 @@ from typing import Any
 def write_atomically(path: Path, data: bytes) -> None:
     """Replace `path` by `data`: a reader, or a crash, sees the old or the new, never a part."""
     part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
-    with part.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
     sync_folder(path.parent)
 
 
@@ -163,6 +166,8 @@ class JobFolder:
     def discard_attempts(self) -> None:
         for left in self.path.glob("attempt-*"):
             shutil.rmtree(left, ignore_errors=True)
+        for unfinished in self.path.glob(f".{self.spec.name}.*.part"):  # its writer was killed
+            unfinished.unlink(missing_ok=True)
 
     def tidy(self) -> None:
         """After the end: drop what only a running job needs. The scan is kept by the scan store; the state, without

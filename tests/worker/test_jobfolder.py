@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -79,6 +81,28 @@ def test_an_atomic_write_that_fails_leaves_the_old(tmp_path: Path, monkeypatch: 
     with pytest.raises(OSError, match="I/O error"):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+_DIES_WRITING = """
+import os, sys
+from pathlib import Path
+from worker.jobfolder import JobFolder
+
+os.fsync = lambda descriptor: os._exit(9)
+JobFolder(Path(sys.argv[1]), sys.argv[2]).prepare({}, 1)
+"""
+
+
+@pytest.mark.parametrize("go_on", [lambda folder: folder.prepare({}, 2), JobFolder.tidy], ids=["again", "given up"])
+def test_a_worker_that_dies_writing_the_job_leaves_nothing_for_good(
+    folder: JobFolder, tmp_path: Path, go_on: Callable[[JobFolder], object]
+) -> None:
+    died = subprocess.run([sys.executable, "-c", _DIES_WRITING, str(tmp_path), folder.path.name])
+    assert died.returncode == 9
+    assert len(list(folder.path.glob(".job.json.*.part"))) == 1
+    go_on(folder)
+    assert list(folder.path.glob(".job.json.*.part")) == []
 
 
 def test_events_are_numbered_across_writers_and_a_torn_line_is_dropped(tmp_path: Path) -> None:
