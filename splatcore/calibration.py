@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from splatcore import _native
+from splatcore.clipping import clipping
 from splatcore.descent import Descent
 from splatcore.exposure import Exposure
 from splatcore.gate import Decision, gate, information
@@ -25,7 +26,7 @@ from splatcore.poses import Normals, Prior, accumulate, step_full
 from splatcore.pyramid import Level
 from splatcore.redundancy import lopsidedness, orbit
 from splatcore.scan import Scan
-from splatcore.splats import Similarity, Splats
+from splatcore.splats import Floats, Similarity, Splats
 from splatcore.static import (
     Static,
     accumulate_static,
@@ -81,6 +82,7 @@ class Calibration:
         self.decision: Decision | None = None
         self.normals: Normals | None = None
         self.exposure = Exposure(len(scan.frames))
+        self._clipping = clipping(scan.projections, scan.bad_pixels)
         self._found = np.zeros(len(scan.frames), bool)  # views that were lost
         self._in_vain = np.zeros(len(scan.frames), bool)  # views looked for at this level and not found
         self._deviation = 0.0  # robust residual, line-integral units, from the last sweep
@@ -141,7 +143,22 @@ class Calibration:
 
     def accumulate(self, here: Level, descent: Descent, some: slice = slice(None)) -> Normals:
         """Normal equations of all or some views, with the detector's yaw as long as it is solved."""
+        here = self._unclipped(here, descent, some)
         return self._accumulate(here, descent.renderer, descent.splats, self._huber(here), some)
+
+    def _unclipped(self, here: Level, descent: Descent, some: slice = slice(None)) -> Level:
+        """The level with all or some views' images as they would be in the mean, had noise not been clipped at zero."""
+        if not self._clipping.deviation:
+            return here
+        images, cone = here.images.copy(), here.nominal.beam == "cone"
+        packed, drawn = self.corrected(here.nominal).packed(), np.empty(images.shape[1:], np.float32)
+        for view in range(len(images))[some]:
+            descent.renderer.render(packed[view], cone, *descent.splats.arrays(), drawn)
+            images[view] -= self._excess(view, drawn)
+        return replace(here, images=images)
+
+    def _excess(self, view: int, drawn: Floats) -> Floats:
+        return self._clipping.excess(drawn, float(self.exposure.offset[view]))
 
     def _accumulate(
         self, here: Level, renderer: _native.Renderer32, splats: Splats, huber: float, some: slice = slice(None)
@@ -159,7 +176,8 @@ class Calibration:
     def _softened(self, here: Level, descent: Descent) -> tuple[Normals, float]:
         """Normal equations at the resolution that the splats have, and how many pixels count as one there."""
         frames = self.corrected(here.nominal)
-        soft = low_passed(here, frames, descent.renderer, descent.splats, self._threads)
+        excess = self._excess if self._clipping.deviation else None
+        soft = low_passed(here, frames, descent.renderer, descent.splats, self._threads, excess)
         if soft is None:
             normals = self.accumulate(here, descent)
             self._deviation = _deviation(normals)
@@ -290,7 +308,7 @@ class Calibration:
         covariance = pose_covariance(
             descent.splats,
             self.corrected(here.nominal),
-            here.images,
+            self._unclipped(here, descent).images,
             here.mask,
             self._huber(here),
             self.prior,

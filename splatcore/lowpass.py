@@ -10,6 +10,7 @@ poses see no part of a residual that a sharper or softer image of the same splat
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,10 +45,17 @@ class LowPassed:
 
 
 def low_passed(
-    here: Level, frames: Frames, renderer: _native.Renderer32, splats: Splats, threads: int
+    here: Level,
+    frames: Frames,
+    renderer: _native.Renderer32,
+    splats: Splats,
+    threads: int,
+    excess: Callable[[int, Floats], Floats] | None = None,
 ) -> LowPassed | None:
     """The level, binned by two and filtered by a Gaussian, as `splats` leave it at the corrected `frames`; None where
-    splats, or the detail that views share, are as fine as pixels."""
+    splats, or the detail that views share, are as fine as pixels.
+
+    excess: what the images of a view, drawn as given, hold in the mean beyond it (splatcore.clipping)."""
     size = _width(splats, len(frames))
     binning = (_BINNING if frames.rows > 1 else 1, _BINNING if frames.cols > 1 else 1)
     small = frames.binned(*binning)
@@ -67,7 +75,8 @@ def low_passed(
     for k, target in enumerate(here.images):
         renderer.render(packed[k], cone, *splats.arrays(), residual)
         fine.render(packed_small[k], cone, *splats.arrays(), drawn)
-        residual -= target
+        expected = residual if excess is None else residual + excess(k, residual)
+        np.subtract(expected, target, out=residual)
         if here.mask is not None:
             residual *= weights
         binned = _filtered(means_of_blocks(residual[None], binning)[0], sigmas)

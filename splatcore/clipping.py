@@ -1,0 +1,61 @@
+"""Noise that was clipped at zero, so that what was measured is in the mean more than what was there.
+
+Line integrals below zero do not exist, and many a scanner's software (and the noise of R2-Gaussian's protocol) sets
+them to zero. In air half the noise is gone then, and its mean is 0.4 standard deviations. Poses found by least squares
+follow that mean: a view looks better the smaller its object's shadow is, so it turns thin objects towards their edge.
+The median, which is what splats are fitted to, is not moved by clipping. (docs/method/geometry.md)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatcore.projections import Mask
+from splatcore.splats import Floats
+
+_VIEWS = 16  # that the noise is taken from
+_LEAST = 0.01  # share of pixels that are exactly zero, from which they are noise's work
+_MIXED = (0.2, 0.7)  # share of positive pixels between them: half in air, hardly any where there is no noise at all
+_NEGATIVE = 0.001  # of the zeros: fewer than that are below zero
+_MEDIAN = 0.6745  # of the absolute value of a standard normal deviate
+# -log of the mean of max(0, n + z) - z for z >= 0, n standard normal: right to 0.00013 of a standard deviation.
+_LOG = (0.918939, 1.253314, 0.285398, 0.0265)
+
+
+@dataclass(frozen=True)
+class Clipping:
+    """How far clipping at zero moves the mean of a pixel."""
+
+    deviation: float  # of the noise in air, line integral; zero where nothing is clipped
+
+    def excess(self, drawn: Floats, offset: float = 0.0) -> Floats:
+        """What it adds to the mean of pixels whose line integrals are `drawn`, measured with an offset more.
+
+        With z the true value in standard deviations: phi(z) - z Phi(-z), of them."""
+        z = np.maximum(drawn + np.float32(offset), 0) * np.float32(1 / self.deviation)
+        a, b, c, d = (np.float32(each) for each in _LOG)
+        out: Floats = np.float32(self.deviation) * np.exp(-(a + z * (b + z * (c + z * d))))
+        return out
+
+
+def clipping(projections: Floats, bad_pixels: Mask | None) -> Clipping:
+    """Whether line integrals [views, rows, cols] are clipped at zero, and the noise that they had. bad_pixels [rows,
+    cols] or None.
+
+    Told by the pixels between two exact zeros: in air half of them are positive, and as far from zero as noise is."""
+    picked = np.unique(np.linspace(0, len(projections) - 1, min(len(projections), _VIEWS)).astype(int))
+    images = projections[picked]
+    good = np.ones(images.shape[1:], bool) if bad_pixels is None else ~bad_pixels
+    if images.shape[2] == 1:  # a detector of one column: its rows are beside each other
+        images, good = images.swapaxes(1, 2), good.T
+    zero = (images == 0) & good
+    many = np.count_nonzero(zero)
+    if many < _LEAST * np.count_nonzero(good) * len(images) or np.count_nonzero(images < 0) > _NEGATIVE * many:
+        return Clipping(0.0)
+    between = images[:, :, 1:-1][zero[:, :, :-2] & zero[:, :, 2:] & good[:, 1:-1]]
+    positive = between[between > 0]
+    if not _MIXED[0] * between.size < positive.size < _MIXED[1] * between.size:
+        return Clipping(0.0)
+    return Clipping(float(np.median(positive)) / _MEDIAN)

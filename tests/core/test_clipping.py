@@ -1,0 +1,71 @@
+"""Noise clipped at zero: found where it is, and the poses are not moved by it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from splatcore.clipping import Clipping, clipping
+
+
+def air(deviation: float, shape: tuple[int, ...] = (20, 48, 48), seed: int = 0) -> np.ndarray:
+    """A box that absorbs, in air, with noise. Float32, unclipped."""
+    rng = np.random.default_rng(seed)
+    images = np.zeros(shape)
+    images[:, shape[1] // 4 : -shape[1] // 4, shape[2] // 3 : -shape[2] // 3] = 1.0
+    return (images + rng.normal(0, deviation, shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("offset", [0.0, -0.3, 0.5])
+def test_the_excess_is_the_mean_of_clipped_noise(offset: float) -> None:
+    z = np.linspace(0, 8, 400, dtype=np.float32)
+    at = np.maximum(z + offset, 0)
+    exact = 0.02 * (norm.pdf(at) - at * norm.cdf(-at))
+    assert np.abs(Clipping(0.02).excess(0.02 * z, 0.02 * offset) - exact).max() < 0.02 * 1.5e-4
+
+
+def test_the_excess_is_what_drawing_shows() -> None:
+    rng = np.random.default_rng(1)
+    noise = rng.normal(0, 0.1, 400_000)
+    for true in (0.0, 0.05, 0.2):
+        more = np.maximum(true + noise, 0).mean() - true
+        assert Clipping(0.1).excess(np.float32([true]))[0] == pytest.approx(more, abs=5e-4)
+
+
+# Of some 4,000 deviates a median is known to 2 %.
+@pytest.mark.parametrize("deviation", [0.003, 0.05])
+def test_clipped_noise_is_found_and_measured(deviation: float) -> None:
+    assert clipping(np.maximum(air(deviation), 0), None).deviation == pytest.approx(deviation, rel=0.06)
+
+
+def test_a_line_detector_whose_line_is_a_column() -> None:
+    images = np.maximum(air(0.05)[:, :1], 0).swapaxes(1, 2)
+    assert clipping(images, None).deviation == pytest.approx(0.05, rel=0.3)
+    assert clipping(np.ascontiguousarray(images.swapaxes(1, 2)), None) == clipping(images, None)
+
+
+def test_nothing_is_clipped_where_noise_is_whole_or_absent() -> None:
+    whole = air(0.05)
+    assert clipping(whole, None) == Clipping(0.0)
+    assert clipping(np.maximum(whole, 0) - np.float32(0.01), None) == Clipping(0.0)  # then moved
+    assert clipping(np.rint(np.maximum(air(0.0), 0)), None) == Clipping(0.0)  # no noise
+    assert clipping(air(0.05) + 1, None) == Clipping(0.0)  # no air
+
+
+def test_air_that_lies_off_zero_is_left_alone() -> None:
+    """What zeros are left there are too few to tell the noise by."""
+    assert clipping(np.maximum(air(0.05) + np.float32(0.06), 0), None) == Clipping(0.0)
+
+
+def test_bad_pixels_do_not_count() -> None:
+    images = np.maximum(air(0.05), 0)
+    bad = np.zeros(images.shape[1:], bool)
+    bad[:, ::2] = True
+    images[:, bad] = 0
+    assert clipping(images, bad) == Clipping(0.0)  # no two good ones are beside each other
+    bad[:] = False
+    bad[::3] = True
+    images = np.maximum(air(0.05), 0)
+    images[:, bad] = 7
+    assert clipping(images, bad).deviation == pytest.approx(0.05, rel=0.06)
