@@ -212,8 +212,10 @@ class Calibration:
             self.static = Static()
         return self.decision.sentence()
 
-    def sweep(self, here: Level, descent: Descent, finest: int) -> dict[str, float]:
-        """One Gauss-Newton step of all poses; the splats follow strain and gauge. Returns how far poses moved."""
+    def sweep(self, here: Level, descent: Descent, finest: int, waiting: bool = False) -> dict[str, float]:
+        """One Gauss-Newton step of all poses; the splats follow strain and gauge. Returns how far poses moved.
+
+        waiting: turns that a view hardly shows stay as they are, for the splats do not hold yet what shows them."""
         before, static = self.motions, self.at(here.nominal)
         coarse = here.factor > finest or self._sweeps < STATIC_FIRST
         alone = self._alone
@@ -235,7 +237,7 @@ class Calibration:
             reach = _REACH_PX * here.pixel_at_isocentre_mm
             limit = np.array([reach / self._radius] * 3 + [3 * reach] * 3)
             turned = float(np.deg2rad(static.yaw_deg))
-            motions, strain, yaw = step_full(normals, before, self.prior, limit, caution, turned, self._found)
+            motions, strain, yaw = step_full(normals, before, self.prior, limit, caution, turned, self._found, waiting)
             static = replace(static, yaw_deg=static.yaw_deg + float(np.rad2deg(yaw)))
             if self._separable:
                 static, motions = split_static(here.nominal, static, motions)

@@ -2,8 +2,8 @@
 
 Line integrals below zero do not exist, and many a scanner's software (and the noise of R2-Gaussian's protocol) sets
 them to zero. In air half the noise is gone then, and its mean is 0.4 standard deviations. Poses found by least squares
-follow that mean: a view looks better the smaller its object's shadow is, so it turns thin objects towards their edge.
-The median, which is what splats are fitted to, is not moved by clipping. (docs/method/geometry.md)
+follow that mean: air seems to absorb, a larger shadow takes up more of that, so views of thin objects turn away from
+their edge. The median, which is what splats are fitted to, is not moved by clipping. (docs/method.md, section 4)
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from splatcore.planar import in_plane
 from splatcore.splats import Floats, Splats
 
 _CLEAR = 0.1  # of the information about the turn that is shown best
+_STILL = 1e4  # of the information about turns: as good as certain
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,7 @@ def step_full(
     caution: float = 1.0,
     yaw: float = 0.0,
     found: Array | None = None,
+    waiting: bool = False,
 ) -> tuple[RigidMotions, Array, float]:
     """New poses after one damped Gauss-Newton step, the strain [3, 3] that the object's means must follow, and the
     step of the detector's yaw, rad (zero where the normal equations do not hold it).
@@ -102,6 +104,7 @@ def step_full(
     yaw: the detector's present yaw, rad, which its prior pulls towards zero.
     found [views]: whether a view's place was found by a search. Where its image shows its motion clearly, its prior
     does without the caution, which would draw it back.
+    waiting: turns that a view hardly shows stay as they are.
     """
     noise = caution * normals.noise
     precision = prior.precision()
@@ -114,6 +117,11 @@ def step_full(
     gradient = normals.gradient / noise[:, None]
     views = hessian[:, :6, :6] + hold
     views += 1e-3 * views * np.eye(6)
+    if waiting:
+        for block, rigid in zip(views, normals.rigid, strict=True):
+            clear = clear_directions(rigid)
+            if clear.shape[1] < 6:
+                block += _STILL * np.trace(block[:3, :3]) * (np.eye(6) - clear @ clear.T)
     pull = gradient[:, :6] + np.einsum("vij,vj->vi", hold, offset)
     mixed = hessian[:, :6, 6:]
     solved = np.linalg.solve(views, np.concatenate([pull[..., None], mixed], axis=2))

@@ -49,6 +49,7 @@ from splatcore.static import Static
 from splatcore.structure import aligned
 
 _SETTLE_IN = 0.25  # share of a level's steps before its first pose sweep, at most two epochs
+_WAIT = 0.25  # share of a level's steps, but of the coarsest, in which turns that a view hardly shows are left alone
 _OFTEN, _SELDOM = 16, 3  # a fine level is swept after each of its first 16 epochs, then after every third
 _WORTH_THREADS = 4_000  # splats
 _COARSE = Rates(mean=0.05, log_scale=0.01, quat=0.01)  # shapes that give way easily let the object be strained
@@ -242,7 +243,8 @@ class _Run:
             moved: dict[str, float] = {}
             found = 0
             if not calibration.fixed and step >= first_sweep and due:
-                moved = calibration.sweep(here, descent, finest)
+                waiting = step <= _WAIT * work.steps and here.factor < self._schedule.coarsest
+                moved = calibration.sweep(here, descent, finest, waiting)
                 if 2 * step >= work.steps:  # by now most views agree
                     found = calibration.find_lost(here, descent, around=step == work.steps)
                 packed = calibration.corrected(here.nominal).packed()

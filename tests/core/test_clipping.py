@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from splatcore import _native
 from splatcore.clipping import Clipping, clipping
+from splatcore.geometry import circular
+from splatcore.poses import accumulate
+from splatcore.splats import Splats
 
 
 def air(deviation: float, shape: tuple[int, ...] = (20, 48, 48), seed: int = 0) -> np.ndarray:
@@ -69,3 +73,38 @@ def test_bad_pixels_do_not_count() -> None:
     images = np.maximum(air(0.05), 0)
     images[:, bad] = 7
     assert clipping(images, bad).deviation == pytest.approx(0.05, rel=0.06)
+
+
+def plate_turned_by_noise(corrected: bool) -> tuple[float, float]:
+    """By how much clipped noise turns views of a known plate away from their edge, in the mean, and the standard error
+    of that. Milliradians."""
+    views, deviation, rng = 720, 0.05, np.random.default_rng(4)
+    x, z = (each.ravel() for each in np.meshgrid(np.arange(-40, 41, 4), np.arange(-24, 25, 4)))
+    plate = Splats(
+        np.stack([x, 0 * x, z], axis=1).astype(np.float32),
+        np.tile(np.float32([3, 1.5, 3]), (len(x), 1)),
+        np.tile(np.float32([1, 0, 0, 0]), (len(x), 1)),
+        np.full(len(x), 0.03, np.float32),
+    )
+    angles = np.linspace(0, 360, views, endpoint=False) + 0.25
+    frames = circular("cone", angles, 500, 700, 64, 64, (3.0, 3.0))
+    renderer, images = _native.Renderer32(64, 64, 1), np.empty((views, 64, 64), np.float32)
+    for image, frame in zip(images, frames.packed(), strict=True):
+        renderer.render(frame, True, *plate.arrays(), image)
+    noisy = np.maximum(images + rng.normal(0, deviation, images.shape).astype(np.float32), 0)
+    if corrected:
+        noisy -= clipping(noisy, None).excess(images)
+    normals = accumulate(renderer, plate, frames, noisy, None, 1.0)
+    turn = -1e3 * normals.gradient[:, 2] / normals.hessian[:, 2, 2]
+    # The source, on the x axis at first, goes round in the angle's sense; the object's own turn is the other way.
+    larger = -turn * np.sign(np.sin(np.deg2rad(2 * angles)))
+    away = np.abs(np.rad2deg(np.arctan(np.tan(np.deg2rad(angles)))))
+    near_edge = larger[(away > 3) & (away < 60)]
+    return float(near_edge.mean()), float(near_edge.std() / np.sqrt(len(near_edge)))
+
+
+def test_clipped_noise_enlarges_shadows_and_no_longer_does() -> None:
+    mean, error = plate_turned_by_noise(corrected=False)
+    assert mean > 5 * error, (mean, error)
+    rest, error = plate_turned_by_noise(corrected=True)
+    assert abs(rest) < 3 * error, (rest, error)

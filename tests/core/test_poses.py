@@ -104,6 +104,23 @@ def test_turns_that_an_image_hardly_shows_are_not_clear():
     assert clear_directions(np.zeros((6, 6))).shape == (6, 3)  # nothing in sight
 
 
+def test_turns_that_an_image_hardly_shows_wait_and_all_else_moves():
+    splats, frames, renderer, draw = scene()
+    nearly_round = Splats(
+        splats.means * np.float32([0.05, 0.05, 1]), np.full_like(splats.scales, 6.0), *splats.arrays()[2:]
+    )
+    turned = RigidMotions.exp(np.tile([0.004, 0.004, 0.004], (10, 1)), np.tile([0.5, 0.5, 0.5], (10, 1)))
+    images = draw(nearly_round, turned.correct(frames))
+    normals = accumulate(renderer, nearly_round, frames, images, None, 1.0)
+    known = Prior(LOOSE.rotation, LOOSE.translation, strain=1e-9)
+    for waiting in (False, True):
+        step, _, _ = step_full(normals, RigidMotions.identity(10), known, LIMIT, waiting=waiting)
+        omega, tau = step.vectors()
+        assert np.abs(tau[:, 2] - 0.5).max() < 0.1
+        about_axis = np.abs(omega[:, 2])
+        assert about_axis.max() < 1e-4 if waiting else about_axis.max() > 1e-3, about_axis
+
+
 def test_steps_are_limited():
     splats, frames, renderer, draw = scene()
     far = RigidMotions.exp(np.tile([0, 0, 0.3], (10, 1)), np.zeros((10, 3)))
