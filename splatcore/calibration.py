@@ -150,12 +150,18 @@ class Calibration:
         """The level with all or some views' images as they would be in the mean, had noise not been clipped at zero."""
         if not self._clipping.deviation:
             return here
-        images, cone = here.images.copy(), here.nominal.beam == "cone"
-        packed, drawn = self.corrected(here.nominal).packed(), np.empty(images.shape[1:], np.float32)
+        images, packed = here.images.copy(), self.corrected(here.nominal).packed()
         for view in range(len(images))[some]:
-            descent.renderer.render(packed[view], cone, *descent.splats.arrays(), drawn)
-            images[view] -= self._excess(view, drawn)
+            images[view] = self.unclipped(here, descent, view, packed[view])
         return replace(here, images=images)
+
+    def unclipped(self, here: Level, descent: Descent, view: int, frame: Array) -> Floats:
+        """One view's image so, by what the splats draw at its packed frame. [rows, cols]"""
+        if not self._clipping.deviation:
+            return here.images[view]
+        drawn = np.empty(here.images.shape[1:], np.float32)
+        descent.renderer.render(frame, here.nominal.beam == "cone", *descent.splats.arrays(), drawn)
+        return here.images[view] - self._excess(view, drawn)
 
     def _excess(self, view: int, drawn: Floats) -> Floats:
         return self._clipping.excess(drawn, float(self.exposure.offset[view]))

@@ -231,7 +231,9 @@ class _Run:
             now["order"] = now["order"] or self._rng.permutation(views).tolist()
             view = now["order"].pop()
             now["step"] += 1
-            now["loss"] += descent.step(packed[view], cone, here.images[view], here.mask)
+            # The loss follows the median, which clipping moves in blocks of pixels only.
+            target = here.images[view] if here.factor == 1 else calibration.unclipped(here, descent, view, packed[view])
+            now["loss"] += descent.step(packed[view], cone, target, here.mask)
             if now["order"] and now["step"] < work.steps:
                 continue
             step, loss = now["step"], now["loss"]
