@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 from scipy.stats import norm
 
 from splatcore import _native
 from splatcore.clipping import Clipping, clipping
 from splatcore.geometry import circular
+from splatcore.options import Options
 from splatcore.poses import accumulate
+from splatcore.reconstruct import drain, reconstruct
+from splatcore.scan import read_scan
+from splatcore.simulate import Simulation, simulate
 from splatcore.splats import Splats
+
+from .phantom import phantom
 
 
 def air(deviation: float, shape: tuple[int, ...] = (20, 48, 48), seed: int = 0) -> np.ndarray:
@@ -108,3 +117,17 @@ def test_clipped_noise_enlarges_shadows_and_no_longer_does() -> None:
     assert mean > 5 * error, (mean, error)
     rest, error = plate_turned_by_noise(corrected=True)
     assert abs(rest) < 3 * error, (rest, error)
+
+
+def test_clipped_noise_feeds_no_fog_in_binned_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    volume = phantom(32)
+    simulate(volume, tmp_path, Simulation(views=30, det=64, noise="r2", seed=2), threads=1, name="object")
+    scan, air = read_scan(tmp_path), binary_erosion(volume == 0, iterations=4)
+    options = Options(quality="preview", rotation="given", calibrate="none", threads=1)
+
+    def fog() -> float:
+        return float(drain(reconstruct(scan, options)).splats.voxelize(scan.volume, 1)[air].mean())
+
+    without = fog()
+    monkeypatch.setattr("splatcore.calibration.clipping", lambda *_: Clipping(0.0))
+    assert without < 0.2 * fog()
