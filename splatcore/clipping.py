@@ -15,7 +15,7 @@ import numpy as np
 from splatcore.projections import Mask
 from splatcore.splats import Floats
 
-_VIEWS = 16  # that the noise is taken from
+_VIEWS, _PIXELS = 16, 2**22  # that the noise is taken from, at most: of large views every so many rows
 _LEAST = 0.01  # share of pixels that are exactly zero, from which they are noise's work
 _MIXED = (0.2, 0.7)  # share of positive pixels between them: half in air, hardly any where there is no noise at all
 _NEGATIVE = 0.001  # of the zeros: fewer than that are below zero
@@ -46,8 +46,9 @@ def clipping(projections: Floats, bad_pixels: Mask | None) -> Clipping:
 
     Told by the pixels between two exact zeros: in air half of them are positive, and as far from zero as noise is."""
     picked = np.unique(np.linspace(0, len(projections) - 1, min(len(projections), _VIEWS)).astype(int))
-    images = projections[picked]
-    good = np.ones(images.shape[1:], bool) if bad_pixels is None else ~bad_pixels
+    rows = slice(None, None, max(1, len(picked) * projections[0].size // _PIXELS))
+    images = np.stack([projections[view][rows] for view in picked])
+    good = np.ones(images.shape[1:], bool) if bad_pixels is None else ~bad_pixels[rows]
     if images.shape[2] == 1:  # a detector of one column: its rows are beside each other
         images, good = images.swapaxes(1, 2), good.T
     zero = (images == 0) & good

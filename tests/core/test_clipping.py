@@ -131,3 +131,8 @@ def test_clipped_noise_feeds_no_fog_in_binned_pixels(tmp_path: Path, monkeypatch
     without = fog()
     monkeypatch.setattr("splatcore.calibration.clipping", lambda *_: Clipping(0.0))
     assert without < 0.2 * fog()
+
+
+def test_large_views_are_sampled() -> None:
+    view = np.maximum(air(0.05, (1, 1024, 1024)), 0)
+    assert clipping(np.repeat(view, 16, axis=0), None).deviation == pytest.approx(0.05, rel=0.06)
