@@ -24,7 +24,7 @@ from splatcore.frozen import Arrays, freeze, thaw
 from splatcore.options import Options
 from splatcore.scan import Scan
 
-FORMAT, VERSION = "splatct-checkpoint", 4
+FORMAT, VERSION = "splatct-checkpoint", 5
 
 
 def identity(scan: Scan, options: Options) -> dict[str, Any]:

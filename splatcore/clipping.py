@@ -16,9 +16,13 @@ from splatcore.projections import Mask
 from splatcore.splats import Floats
 
 _VIEWS, _PIXELS = 16, 2**22  # that the noise is taken from, at most: of large views every so many rows
-_LEAST = 0.01  # share of pixels that are exactly zero, from which they are noise's work
-_MIXED = (0.2, 0.7)  # share of positive pixels between them: half in air, hardly any where there is no noise at all
-_NEGATIVE = 0.001  # of the zeros: fewer than that are below zero
+_APART = 3  # pixels from a zero to the next one looked at: noise of neighbours may go together
+_LEAST = 0.01  # share of pixels that are exactly zero: fewer are no air
+_NEGATIVE = 0.001  # share of them that may be below zero where noise is clipped
+_MIXED = (0.2, 0.7)  # share of positive pixels between zeros: half in air, hardly any where there is no noise at all
+_ENOUGH = 50  # such pixels
+_QUARTILES = (0.15, 0.6)  # first over third: 0.277 of clipped normal noise, 1 of thin wires all alike
+_STANDS_OUT = (1e-6, 0.2)  # deviation over the largest value: smaller is rounding, larger no image of an object
 _MEDIAN = 0.6745  # of the absolute value of a standard normal deviate
 # -log of the mean of max(0, n + z) - z for z >= 0, n standard normal: right to 0.00013 of a standard deviation.
 _LOG = (0.918939, 1.253314, 0.285398, 0.0265)
@@ -33,8 +37,9 @@ class Clipping:
     def excess(self, drawn: Floats, offset: float = 0.0) -> Floats:
         """What it adds to the mean of pixels whose line integrals are `drawn`, measured with an offset more.
 
-        With z the true value in standard deviations: phi(z) - z Phi(-z), of them."""
-        z = np.maximum(drawn + np.float32(offset), 0) * np.float32(1 / self.deviation)
+        With z the true value in standard deviations: phi(z) - z Phi(-z), of them. An offset below zero is taken for
+        none in air: pixels that are zero nearly always do not show it."""
+        z = np.clip((drawn + np.float32(offset)) * np.float32(1 / self.deviation), 0, 10)
         a, b, c, d = (np.float32(each) for each in _LOG)
         out: Floats = np.float32(self.deviation) * np.exp(-(a + z * (b + z * (c + z * d))))
         return out
@@ -53,10 +58,17 @@ def clipping(projections: Floats, bad_pixels: Mask | None) -> Clipping:
         images, good = images.swapaxes(1, 2), good.T
     zero = (images == 0) & good
     many = np.count_nonzero(zero)
-    if many < _LEAST * np.count_nonzero(good) * len(images) or np.count_nonzero(images < 0) > _NEGATIVE * many:
+    if many < _LEAST * np.count_nonzero(good) * len(images) or np.count_nonzero((images < 0) & good) > _NEGATIVE * many:
         return Clipping(0.0)
-    between = images[:, :, 1:-1][zero[:, :, :-2] & zero[:, :, 2:] & good[:, 1:-1]]
+    inside = slice(_APART, -_APART)
+    amid = zero[:, :, : -2 * _APART] & zero[:, :, 2 * _APART :] & good[:, inside]
+    between = images[:, :, inside][amid]
     positive = between[between > 0]
-    if not _MIXED[0] * between.size < positive.size < _MIXED[1] * between.size:
+    if positive.size < _ENOUGH or not _MIXED[0] * between.size < positive.size < _MIXED[1] * between.size:
         return Clipping(0.0)
-    return Clipping(float(np.median(positive)) / _MEDIAN)
+    first, middle, third = np.quantile(positive, (0.25, 0.5, 0.75))
+    deviation, top = float(middle) / _MEDIAN, float(images.max(where=good, initial=0))
+    like_noise = _QUARTILES[0] * third < first < _QUARTILES[1] * third
+    if not like_noise or not _STANDS_OUT[0] * top < deviation < _STANDS_OUT[1] * top:
+        return Clipping(0.0)
+    return Clipping(deviation)

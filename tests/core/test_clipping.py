@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.stats import norm
 
 from splatcore import _native
@@ -53,7 +53,7 @@ def test_clipped_noise_is_found_and_measured(deviation: float) -> None:
 
 
 def test_a_line_detector_whose_line_is_a_column() -> None:
-    images = np.maximum(air(0.05)[:, :1], 0).swapaxes(1, 2)
+    images = np.maximum(air(0.05, (20, 48, 192))[:, 24:25], 0).swapaxes(1, 2)
     assert clipping(images, None).deviation == pytest.approx(0.05, rel=0.3)
     assert clipping(np.ascontiguousarray(images.swapaxes(1, 2)), None) == clipping(images, None)
 
@@ -71,12 +71,29 @@ def test_air_that_lies_off_zero_is_left_alone() -> None:
     assert clipping(np.maximum(air(0.05) + np.float32(0.06), 0), None) == Clipping(0.0)
 
 
+def test_noise_that_neighbours_share_is_measured_in_full() -> None:
+    noise = gaussian_filter(np.random.default_rng(3).normal(0, 1, (20, 48, 48)), (0, 0.6, 0.6))
+    shared = air(0.0) + np.float32(0.05 / noise.std()) * noise.astype(np.float32)
+    assert clipping(np.maximum(shared, 0), None).deviation == pytest.approx(0.05, rel=0.1)
+
+
+def test_zeros_that_are_no_noise_are_not_believed() -> None:
+    dots = (np.random.default_rng(5).random((16, 48, 48)) < 0.3).astype(np.float32)
+    assert clipping(dots, None) == Clipping(0.0)  # all alike
+    assert clipping(np.maximum(air(0.4)[:, :8], 0), None) == Clipping(0.0)  # no object
+    assert clipping(np.maximum(air(1e-8), 0), None) == Clipping(0.0)  # rounding
+    assert clipping(np.float32([[[0, 0.5, 0, 0, 0, 0.2, 3, 3]]]), None) == Clipping(0.0)  # too few to tell
+    some = np.maximum(air(0.05), 0)
+    some[:, :, 0] -= np.float32(0.01)
+    assert clipping(some, None) == Clipping(0.0)  # zeros beside values below zero
+
+
 def test_bad_pixels_do_not_count() -> None:
     images = np.maximum(air(0.05), 0)
     bad = np.zeros(images.shape[1:], bool)
     bad[:, ::2] = True
     images[:, bad] = 0
-    assert clipping(images, bad) == Clipping(0.0)  # no two good ones are beside each other
+    assert clipping(images, bad) == Clipping(0.0)  # no good one lies amid two others
     bad[:] = False
     bad[::3] = True
     images = np.maximum(air(0.05), 0)
