@@ -133,6 +133,11 @@ class Calibration:
         """The level as if all views had been exposed alike."""
         return replace(here, images=self.exposure.corrected(here.images))
 
+    def find_exposure(self, descent: Descent, corrected: Frames, measured: Level) -> None:
+        """Every view's exposure anew, by its median, which clipping moves in blocks of pixels only."""
+        excess = self._excess if self._clipping.deviation and measured.factor > 1 else None
+        self.exposure.update(descent.renderer, descent.splats, corrected, measured.images, measured.mask, excess)
+
     def at(self, nominal: Frames) -> Static:
         """The static part in the pixels of a level."""
         return self.static.binned(self._scan.frames.cols // nominal.cols)

@@ -37,12 +37,12 @@ class Clipping:
     def excess(self, drawn: Floats, offset: float = 0.0) -> Floats:
         """What it adds to the mean of pixels whose line integrals are `drawn`, measured with an offset more.
 
-        With z the true value in standard deviations: phi(z) - z Phi(-z), of them. An offset below zero is taken for
-        none in air: pixels that are zero nearly always do not show it."""
-        z = np.clip((drawn + np.float32(offset)) * np.float32(1 / self.deviation), 0, 10)
+        With z the true value in standard deviations: phi(z) - z Phi(-z), of them; by z more at -z."""
+        z = (drawn + np.float32(offset)) * np.float32(1 / self.deviation)
+        size = np.minimum(np.abs(z), 10)
         a, b, c, d = (np.float32(each) for each in _LOG)
-        out: Floats = np.float32(self.deviation) * np.exp(-(a + z * (b + z * (c + z * d))))
-        return out
+        out: Floats = np.exp(-(a + size * (b + size * (c + size * d)))) - np.minimum(z, 0)
+        return np.float32(self.deviation) * out
 
 
 def clipping(projections: Floats, bad_pixels: Mask | None) -> Clipping:

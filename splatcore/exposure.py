@@ -11,6 +11,7 @@ object can take it up entirely. Only air tells, so where there is too little of 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,7 @@ from splatcore.splats import Floats, Splats
 _TOLERANCE = 0.05  # one standard deviation of b: a tube that differs by more from view to view is broken
 _AIR = 0.02  # of the largest line integral: I_0
 _LEAST_AIR = 0.01  # share of pixels below I_0 from which what all views share may be told
-# Shares of the largest line integral, below which nothing is corrected. Noise clipped at zero feigns a common offset of
-# 0.003 or so; to take that out costs the poses more (0.02 degrees on one scan) than so small a drift does.
+# Shares of the largest line integral, below which nothing is corrected.
 _LEAST_SPREAD, _LEAST_MEAN = 0.001, 0.01
 _WORTH_TELLING = 0.002  # RMS of b over views, below which nothing is said
 
@@ -41,21 +41,36 @@ class Exposure:
         return images - self.offset.astype(np.float32)[:, None, None]
 
     def update(
-        self, renderer: _native.Renderer32, splats: Splats, frames: Frames, images: Floats, mask: Floats | None
+        self,
+        renderer: _native.Renderer32,
+        splats: Splats,
+        frames: Frames,
+        images: Floats,
+        mask: Floats | None,
+        excess: Callable[[int, Floats], Floats] | None = None,
     ) -> None:
-        """Find the offsets anew from the images as measured; zero where they are too small to be worth a correction."""
+        """Find the offsets anew from the images as measured; zero where they are too small to be worth a correction.
+
+        excess: what the images of a view, drawn as given, hold beyond it but for its offset (splatcore.clipping)."""
         top = float(images.max())
-        found = offsets(renderer, splats, frames, images, mask, top)
+        found = offsets(renderer, splats, frames, images, mask, top, excess)
         worth = found.std() > _LEAST_SPREAD * top or abs(found.mean()) > _LEAST_MEAN * top
         self.offset = found if worth else np.zeros_like(found)
 
 
 def offsets(
-    renderer: _native.Renderer32, splats: Splats, frames: Frames, images: Floats, mask: Floats | None, top: float
+    renderer: _native.Renderer32,
+    splats: Splats,
+    frames: Frames,
+    images: Floats,
+    mask: Floats | None,
+    top: float,
+    excess: Callable[[int, Floats], Floats] | None = None,
 ) -> Array:
     """b_k of every view, given the splats: unitless, to be taken from the view's line integrals. [views]
 
-    images [views, rows, cols] as measured; mask [rows, cols] share of good pixels; top: largest line integral."""
+    images [views, rows, cols] as measured; mask [rows, cols] share of good pixels; top: largest line integral; excess
+    as for `Exposure.update`."""
     found, air = np.zeros(len(frames)), 0.0
     drawn, level = np.empty(images.shape[1:], np.float32), _AIR * top
     for k, frame in enumerate(frames.packed()):
@@ -64,7 +79,7 @@ def offsets(
         if mask is not None:
             weight = weight * mask
         air += float((weight > 0.5).mean()) / len(frames)
-        difference = images[k] - drawn
+        difference = images[k] - (drawn if excess is None else drawn + excess(k, drawn))
         middle, spread = _median(difference, weight)
         variance = spread**2 / max(float(weight.sum()), 1e-9)
         found[k] = middle * _TOLERANCE**2 / (_TOLERANCE**2 + variance)

@@ -252,7 +252,7 @@ class _Run:
                 packed = calibration.corrected(here.nominal).packed()
             if drifting and step >= first_sweep:
                 corrected = calibration.corrected(here.nominal)
-                calibration.exposure.update(descent.renderer, descent.splats, corrected, measured, here.mask)
+                calibration.find_exposure(descent, corrected, replace(here, images=measured))
                 here = replace(here, images=calibration.exposure.corrected(measured))
             now["loss"] = 0.0
             also = f"; lost views found: {found}" if found else ""

@@ -30,10 +30,10 @@ def air(deviation: float, shape: tuple[int, ...] = (20, 48, 48), seed: int = 0) 
     return (images + rng.normal(0, deviation, shape)).astype(np.float32)
 
 
-@pytest.mark.parametrize("offset", [0.0, -0.3, 0.5])
+@pytest.mark.parametrize("offset", [0.0, -1.3, 0.5])
 def test_the_excess_is_the_mean_of_clipped_noise(offset: float) -> None:
     z = np.linspace(0, 8, 400, dtype=np.float32)
-    at = np.maximum(z + offset, 0)
+    at = z + offset
     exact = 0.02 * (norm.pdf(at) - at * norm.cdf(-at))
     assert np.abs(Clipping(0.02).excess(0.02 * z, 0.02 * offset) - exact).max() < 0.02 * 1.5e-4
 
