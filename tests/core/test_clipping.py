@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +13,15 @@ from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.stats import norm
 
 from splatcore import _native
+from splatcore.calibration import Calibration
 from splatcore.clipping import Clipping, clipping
 from splatcore.geometry import circular
+from splatcore.grid import VolumeGrid
 from splatcore.options import Options
-from splatcore.poses import accumulate
-from splatcore.reconstruct import drain, reconstruct
-from splatcore.scan import read_scan
+from splatcore.poses import Normals, step_full
+from splatcore.pyramid import Level, level
+from splatcore.reconstruct import drain, reconstruct, resolved
+from splatcore.scan import Scan, read_scan
 from splatcore.simulate import Simulation, simulate
 from splatcore.splats import Splats
 
@@ -101,9 +107,9 @@ def test_bad_pixels_do_not_count() -> None:
     assert clipping(images, bad).deviation == pytest.approx(0.05, rel=0.06)
 
 
-def plate_turned_by_noise(corrected: bool) -> tuple[float, float]:
-    """By how much clipped noise turns views of a known plate away from their edge, in the mean, and the standard error
-    of that. Milliradians."""
+def plate_turned_by_noise(seen: Callable[[Calibration, Level, Any], Normals], clipped: bool = True) -> list[float]:
+    """By how much noise turns views of a known plate away from their edge, in the mean, and the standard error of that.
+    Milliradians."""
     views, deviation, rng = 720, 0.05, np.random.default_rng(4)
     x, z = (each.ravel() for each in np.meshgrid(np.arange(-40, 41, 4), np.arange(-24, 25, 4)))
     plate = Splats(
@@ -117,22 +123,33 @@ def plate_turned_by_noise(corrected: bool) -> tuple[float, float]:
     renderer, images = _native.Renderer32(64, 64, 1), np.empty((views, 64, 64), np.float32)
     for image, frame in zip(images, frames.packed(), strict=True):
         renderer.render(frame, True, *plate.arrays(), image)
-    noisy = np.maximum(images + rng.normal(0, deviation, images.shape).astype(np.float32), 0)
-    if corrected:
-        noisy -= clipping(noisy, None).excess(images)
-    normals = accumulate(renderer, plate, frames, noisy, None, 1.0)
+    noisy = images + rng.normal(0, deviation, images.shape).astype(np.float32)
+    noisy = np.maximum(noisy, 0) if clipped else noisy
+    scan = Scan("plate", noisy, frames, VolumeGrid((24, 32, 32), (3.0, 3.0, 3.0)))
+    calibration = Calibration(scan, resolved(scan, Options(threads=1)))
+    normals = seen(calibration, level(scan, 1), SimpleNamespace(renderer=renderer, splats=plate))
     turn = -1e3 * normals.gradient[:, 2] / normals.hessian[:, 2, 2]
     # The source, on the x axis at first, goes round in the angle's sense; the object's own turn is the other way.
     larger = -turn * np.sign(np.sin(np.deg2rad(2 * angles)))
     away = np.abs(np.rad2deg(np.arctan(np.tan(np.deg2rad(angles)))))
     near_edge = larger[(away > 3) & (away < 60)]
-    return float(near_edge.mean()), float(near_edge.std() / np.sqrt(len(near_edge)))
+    return [float(near_edge.mean()), float(near_edge.std() / np.sqrt(len(near_edge)))]
 
 
-def test_clipped_noise_enlarges_shadows_and_no_longer_does() -> None:
-    mean, error = plate_turned_by_noise(corrected=False)
+SEEN = {
+    "whole": lambda calibration, here, descent: calibration.accumulate(here, descent),
+    "low-passed": lambda calibration, here, descent: calibration._softened(here, descent)[0],
+}
+
+
+@pytest.mark.parametrize("how", SEEN)
+def test_clipped_noise_enlarges_shadows_and_no_longer_does(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    rest, error = plate_turned_by_noise(SEEN[how])
+    assert abs(rest) < 3 * error, (rest, error)
+    monkeypatch.setattr("splatcore.calibration.clipping", lambda *_: Clipping(0.0))
+    mean, error = plate_turned_by_noise(SEEN[how])
     assert mean > 5 * error, (mean, error)
-    rest, error = plate_turned_by_noise(corrected=True)
+    rest, error = plate_turned_by_noise(SEEN[how], clipped=False)
     assert abs(rest) < 3 * error, (rest, error)
 
 
@@ -151,5 +168,36 @@ def test_clipped_noise_feeds_no_fog_in_binned_pixels(tmp_path: Path, monkeypatch
 
 
 def test_large_views_are_sampled() -> None:
+    """Every fourth row of these: the others hold what would be no air."""
     view = np.maximum(air(0.05, (1, 1024, 1024)), 0)
+    view[:, np.arange(1024) % 4 != 0] += 1
     assert clipping(np.repeat(view, 16, axis=0), None).deviation == pytest.approx(0.05, rel=0.06)
+
+
+def test_unclear_turns_wait_in_the_first_quarter_of_a_level(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulate(phantom(32), tmp_path, Simulation(views=30, det=96, sigma_rot=0.02, seed=2), threads=1, name="object")
+    swept: dict[int, list[bool]] = {}
+    sweep = Calibration.sweep
+
+    def spy(self: Calibration, here: Level, descent: Any, finest: int, waiting: bool = False) -> dict[str, float]:
+        swept.setdefault(here.factor, []).append(waiting)
+        return sweep(self, here, descent, finest, waiting)
+
+    told: list[bool] = []
+
+    def step(*given: Any) -> Any:
+        told.append(given[-1])
+        return step_full(*given)
+
+    monkeypatch.setattr(Calibration, "sweep", spy)
+    monkeypatch.setattr("splatcore.calibration.step_full", step)
+    options = Options(quality="preview", rotation="given", gate="off", threads=1)
+    drain(reconstruct(read_scan(tmp_path), options))
+    coarsest, *others = sorted(swept, reverse=True)
+    assert not any(swept[coarsest])
+    assert others
+    for factor in others:
+        often = swept[factor]
+        assert often == sorted(often, reverse=True)
+        assert 0.1 < sum(often) / len(often) < 0.3
+    assert sum(told) == sum(map(sum, swept.values()))
