@@ -110,7 +110,7 @@ def test_bad_pixels_do_not_count() -> None:
 def plate_turned_by_noise(seen: Callable[[Calibration, Level, Any], Normals], clipped: bool = True) -> list[float]:
     """By how much noise turns views of a known plate away from their edge, in the mean, and the standard error of that.
     Milliradians."""
-    views, deviation, rng = 720, 0.05, np.random.default_rng(4)
+    views, deviation, rng = 96, 0.05, np.random.default_rng(4)
     x, z = (each.ravel() for each in np.meshgrid(np.arange(-40, 41, 4), np.arange(-24, 25, 4)))
     plate = Splats(
         np.stack([x, 0 * x, z], axis=1).astype(np.float32),
@@ -119,8 +119,8 @@ def plate_turned_by_noise(seen: Callable[[Calibration, Level, Any], Normals], cl
         np.full(len(x), 0.03, np.float32),
     )
     angles = np.linspace(0, 360, views, endpoint=False) + 0.25
-    frames = circular("cone", angles, 500, 700, 64, 64, (3.0, 3.0))
-    renderer, images = _native.Renderer32(64, 64, 1), np.empty((views, 64, 64), np.float32)
+    frames = circular("cone", angles, 500, 700, 320, 320, (0.6, 0.6))
+    renderer, images = _native.Renderer32(320, 320, 1), np.empty((views, 320, 320), np.float32)
     for image, frame in zip(images, frames.packed(), strict=True):
         renderer.render(frame, True, *plate.arrays(), image)
     noisy = images + rng.normal(0, deviation, images.shape).astype(np.float32)
@@ -168,9 +168,9 @@ def test_clipped_noise_feeds_no_fog_in_binned_pixels(tmp_path: Path, monkeypatch
 
 
 def test_large_views_are_sampled() -> None:
-    """Every fourth row of these: the others hold what would be no air."""
+    """Every fourth row of these: the others would say that hardly any pixel amid zeros is positive."""
     view = np.maximum(air(0.05, (1, 1024, 1024)), 0)
-    view[:, np.arange(1024) % 4 != 0] += 1
+    view[:, np.arange(1024) % 4 != 0] = 0
     assert clipping(np.repeat(view, 16, axis=0), None).deviation == pytest.approx(0.05, rel=0.06)
 
 
