@@ -107,7 +107,9 @@ def test_bad_pixels_do_not_count() -> None:
     assert clipping(images, bad).deviation == pytest.approx(0.05, rel=0.06)
 
 
-def plate_turned_by_noise(seen: Callable[[Calibration, Level, Any], Normals], clipped: bool = True) -> list[float]:
+def plate_turned_by_noise(
+    seen: Callable[[Calibration, Level, Any], Normals], clipped: bool = True
+) -> tuple[float, float]:
     """By how much noise turns views of a known plate away from their edge, in the mean, and the standard error of that.
     Milliradians."""
     views, deviation, rng = 96, 0.05, np.random.default_rng(4)
@@ -133,7 +135,7 @@ def plate_turned_by_noise(seen: Callable[[Calibration, Level, Any], Normals], cl
     larger = -turn * np.sign(np.sin(np.deg2rad(2 * angles)))
     away = np.abs(np.rad2deg(np.arctan(np.tan(np.deg2rad(angles)))))
     near_edge = larger[(away > 3) & (away < 60)]
-    return [float(near_edge.mean()), float(near_edge.std() / np.sqrt(len(near_edge)))]
+    return float(near_edge.mean()), float(near_edge.std() / np.sqrt(len(near_edge)))
 
 
 SEEN = {
